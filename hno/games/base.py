@@ -1,0 +1,227 @@
+"""What a differential game is: boxes, dynamics, costs, a constraint, and the control that maximises the Hamiltonian."""
+
+from __future__ import annotations
+
+import abc
+import hashlib
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from hno.registry import Registry
+
+games: Registry[Game] = Registry("game", "hno.games")
+
+
+class Box(nn.Module):
+    """The axis-aligned box `lo <= x <= hi`.
+
+    Args:
+        lo: lower corner, any shape.
+        hi: upper corner, the same shape, nowhere below `lo`.
+    """
+
+    lo: Tensor
+    hi: Tensor
+
+    def __init__(self, lo: Sequence[object] | Tensor, hi: Sequence[object] | Tensor) -> None:
+        super().__init__()
+        self.register_buffer("lo", torch.as_tensor(lo, dtype=torch.get_default_dtype()))
+        self.register_buffer("hi", torch.as_tensor(hi, dtype=torch.get_default_dtype()))
+        if self.lo.shape != self.hi.shape or bool((self.lo > self.hi).any()):
+            raise ValueError(f"A box needs lo <= hi of equal shape; got lo {self.lo.tolist()}, hi {self.hi.tolist()}.")
+
+    @property
+    def width(self) -> Tensor:
+        """Edge lengths."""
+        return self.hi - self.lo
+
+    def scale(self, x: Tensor) -> Tensor:
+        """Map the box to [-1, 1], shape (..., *box)."""
+        return 2 * (x - self.lo) / self.width - 1
+
+    def clamp(self, x: Tensor) -> Tensor:
+        """The nearest point of the box."""
+        return x.clamp(self.lo, self.hi)
+
+    def contains(self, x: Tensor) -> Tensor:
+        """Whether each point lies in the box, shape (...)."""
+        inside = (self.lo <= x) & (x <= self.hi)
+        return inside.flatten(inside.dim() - self.lo.dim()).all(-1)
+
+    def sample(self, size: int, generator: torch.Generator) -> Tensor:
+        """Uniform points, shape (size, *box)."""
+        unit = torch.rand((size, *self.lo.shape), generator=generator, dtype=self.lo.dtype, device=generator.device)
+        return self.lo + unit.to(self.lo) * self.width
+
+    def widened(self, factor: float) -> Box:
+        """The box with `factor` times the width around the same centre."""
+        centre, half = (self.lo + self.hi) / 2, factor * self.width / 2
+        return Box(centre - half, centre + half)
+
+
+class Game(nn.Module, abc.ABC):
+    """A P-player general-sum differential game with state constraints, in reward form (players maximise V = -J).
+
+    The dynamics are decoupled: `dynamics(x, u)[..., i, :]` depends on the state and control of player i alone. What
+    couples the players is the constraint, which enters every running cost as `penalty(constraint)` (paper, eq. 5).
+
+    A subclass sets the attributes below and overrides the abstract methods; the other methods are shared and final.
+    Methods accept any leading batch shape and both float32 and float64.
+    """
+
+    horizon: float
+    """Length of the game, s."""
+    label_step: float = 0.1
+    """Spacing of label nodes, s."""
+    roles: tuple[int, ...] = (0, 0)
+    """One entry per player; players with equal entries are interchangeable."""
+    state_box: Box
+    """PDE domain, which also scales the operator's inputs, (P, n)."""
+    initial_box: Box
+    """Where episodes start, (P, n)."""
+    control_box: Box
+    """Admissible controls of each player, (m,)."""
+    type_box: Box
+    """Range of each player's type, (P,)."""
+    penalty_height: float = 1e4
+    """Cost rate deep inside the violation set, 1/s."""
+    penalty_slope: float = 5.0
+    """Steepness of the penalty, 1/m for distance constraints."""
+
+    @abc.abstractmethod
+    def dynamics(self, x: Tensor, u: Tensor) -> Tensor:
+        """Time derivative of the state, (B, P, n), (B, P, m) -> (B, P, n)."""
+
+    @abc.abstractmethod
+    def effort(self, u: Tensor) -> Tensor:
+        """Control part of the running cost, (B, P, m) -> (B, P)."""
+
+    @abc.abstractmethod
+    def terminal_value(self, x: Tensor) -> Tensor:
+        """Reward -g_i at the end, (B, P, n) -> (B, P)."""
+
+    @abc.abstractmethod
+    def constraint(self, x: Tensor, theta: Tensor) -> Tensor:
+        """State constraint, at most 0 where safe, (B, P, n), (B, P) -> (B, P)."""
+
+    @abc.abstractmethod
+    def sensors(self, theta: Tensor) -> Tensor:
+        """Branch input: the indicator of the violation set on a lattice (paper, sec. III), (B, P) -> (B, P, S)."""
+
+    @abc.abstractmethod
+    def best_response(self, x: Tensor, own_costate: Tensor) -> Tensor:
+        """argmax of each player's Hamiltonian over its control box, (B, P, n), (B, P, n) -> (B, P, m)."""
+
+    def positions(self, x: Tensor) -> Tensor:
+        """Where the players are in one common frame, m, for pictures, (B, P, n) -> (B, P, 2 or 3)."""
+        return x[..., :2]
+
+    @property
+    def players(self) -> int:
+        """Number of players P."""
+        return len(self.roles)
+
+    @property
+    def state_dim(self) -> int:
+        """Number of states per player n."""
+        return self.state_box.lo.shape[-1]
+
+    @property
+    def control_dim(self) -> int:
+        """Number of controls per player m."""
+        return self.control_box.lo.shape[-1]
+
+    def penalty(self, constraint: Tensor) -> Tensor:
+        """Soft constraint b sigmoid(gamma c) (paper, eq. 5), same shape as `constraint`."""
+        return self.penalty_height * torch.sigmoid(self.penalty_slope * constraint)
+
+    def running_cost(self, x: Tensor, u: Tensor, theta: Tensor) -> Tensor:
+        """Effort plus penalty, 1/s, (B, P)."""
+        return self.effort(u) + self.penalty(self.constraint(x, theta))
+
+    def hamiltonian(self, x: Tensor, costate: Tensor, u: Tensor, theta: Tensor) -> Tensor:
+        """H_i = sum_j <dV_i/dx_j, f_j> - running cost of i, shape (B, P)."""
+        flow = torch.einsum("...ijn,...jn->...i", costate, self.dynamics(x, u))
+        return flow - self.running_cost(x, u, theta)
+
+    def optimal_control(self, x: Tensor, costate: Tensor) -> Tensor:
+        """Every player's maximiser of its own Hamiltonian, (B, P, n), (B, P, P, n) -> (B, P, m)."""
+        return self.best_response(x, own_costate(costate))
+
+    def violates(self, x: Tensor, theta: Tensor) -> Tensor:
+        """Whether any player's constraint is violated (or just met), shape (B,)."""
+        return (self.constraint(x, theta) >= 0).any(-1)
+
+    def fingerprint(self) -> str:
+        """Hash of the game's boxes and of its functions at fixed points: it changes when the physics does."""
+        generator = torch.Generator().manual_seed(0)
+        game = type(self).__name__, self.horizon, self.label_step, self.roles
+        boxes = [self.state_box, self.initial_box, self.control_box, self.type_box]
+        x, u, theta = (box.sample(16, generator) for box in (self.state_box, self.control_box, self.type_box))
+        u = u.unsqueeze(-2).expand(-1, self.players, -1)
+        values = [b for box in boxes for b in (box.lo, box.hi)]
+        values += [self.dynamics(x, u), self.effort(u), self.terminal_value(x), self.constraint(x, theta)]
+        values += [self.penalty(torch.linspace(-2, 2, 9))]
+        digits = [f"{v:.4e}" for tensor in values for v in tensor.double().flatten().tolist()]
+        return hashlib.sha256(repr((game, digits)).encode()).hexdigest()[:16]
+
+
+class ControlAffineGame(Game):
+    """A game whose dynamics are drift(x) + G w(u) with effort sum_k r_k w_k^2, w an increasing map of each control.
+
+    The Hamiltonian is then a concave parabola in every w_k, so its maximiser on a box is the clamped vertex, exactly:
+    w = clamp(G' lambda_ii / 2r).
+    """
+
+    input_matrix: Tensor
+    """G, shape (n, m), a buffer."""
+    effort_weight: Tensor
+    """r, shape (m,), a buffer."""
+
+    @abc.abstractmethod
+    def drift(self, x: Tensor) -> Tensor:
+        """Dynamics at w = 0, (B, P, n) -> (B, P, n)."""
+
+    def affine_input(self, u: Tensor) -> Tensor:
+        """w(u), the input in which the dynamics are affine, (B, P, m) -> (B, P, m)."""
+        return u
+
+    def control_of(self, w: Tensor) -> Tensor:
+        """Inverse of `affine_input`."""
+        return w
+
+    def dynamics(self, x: Tensor, u: Tensor) -> Tensor:
+        """Time derivative of the state, (B, P, n)."""
+        return self.drift(x) + self.affine_input(u) @ self.input_matrix.mT
+
+    def effort(self, u: Tensor) -> Tensor:
+        """Weighted squares of the affine input, 1/s, (B, P)."""
+        return self.affine_input(u).square() @ self.effort_weight
+
+    def best_response(self, x: Tensor, own_costate: Tensor) -> Tensor:
+        """The clamped vertex of each player's Hamiltonian, (B, P, m)."""
+        vertex = own_costate @ self.input_matrix / (2 * self.effort_weight)
+        return self.control_of(vertex.clamp(*map(self.affine_input, (self.control_box.lo, self.control_box.hi))))
+
+
+def own_costate(costate: Tensor) -> Tensor:
+    """The diagonal dV_i / dx_i of a costate, (B, P, P, n) -> (B, P, n)."""
+    return costate.diagonal(dim1=-3, dim2=-2).mT
+
+
+def lattice_indicator(radius: Tensor, first: float, spacing: float, size: int) -> Tensor:
+    """1 where a distance lattice lies below the radius, shape (..., size).
+
+    The comparison is made in lattice steps with a tolerance of a thousandth of a step, so that float rounding does not
+    decide about a radius that falls on a lattice node.
+
+    Args:
+        radius: collision radius, m, shape (...).
+        first: distance of the first node, m.
+        spacing: lattice spacing, m.
+        size: number of nodes.
+    """
+    steps = (radius.unsqueeze(-1) - first) / spacing
+    return (torch.arange(size, device=radius.device) < steps - 1e-3).to(radius.dtype)

@@ -1,0 +1,45 @@
+"""Geometry and vehicle models that several games share."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+GRAVITY = 9.81
+"""Standard gravity as the paper rounds it, m/s^2."""
+DEGREE = math.pi / 180
+"""One degree, rad."""
+
+
+def unicycle_drift(x: Tensor) -> Tensor:
+    """Uncontrolled motion of a unicycle (px, py, psi, v), shape (..., 4)."""
+    _, _, heading, speed = x.unbind(-1)
+    still = torch.zeros_like(speed)
+    return torch.stack([speed * heading.cos(), speed * heading.sin(), still, still], -1)
+
+
+def double_integrator_drift(x: Tensor) -> Tensor:
+    """Uncontrolled motion of positions and velocities (p, v), shape (..., 2 d)."""
+    velocity = x.unflatten(-1, (2, -1))[..., 1, :]
+    return torch.cat([velocity, torch.zeros_like(velocity)], -1)
+
+
+def separation(positions: Tensor, softness: float = 1e-6) -> Tensor:
+    """Distance of each player to its nearest other player, m, (..., P, d) -> (..., P).
+
+    Args:
+        positions: points in one common frame, m.
+        softness: rounds the tip of the cone, m, so that every derivative is finite where players touch.
+    """
+    offset = positions.unsqueeze(-2) - positions.unsqueeze(-3)
+    distance = (offset.square().sum(-1) + softness**2).sqrt()
+    alone = torch.eye(positions.shape[-2], dtype=torch.bool, device=positions.device)
+    return distance.masked_fill(alone, torch.inf).amin(-1)
+
+
+def collision_radius(theta: Tensor, base: float) -> Tensor:
+    """Radius 0.1 sum_j theta_j + 0.05 min_j theta_j + base (paper, sec. IV), m, (..., P) -> (..., P)."""
+    radius = 0.1 * theta.sum(-1, keepdim=True) + 0.05 * theta.amin(-1, keepdim=True) + base
+    return radius.expand_as(theta)

@@ -1,0 +1,64 @@
+"""Two cars side by side exchange their lanes (paper, case 2)."""
+
+from __future__ import annotations
+
+from typing import final
+
+import torch
+from torch import Tensor
+
+from hno.games.base import Box, ControlAffineGame, games, lattice_indicator
+from hno.games.kinematics import DEGREE, collision_radius, separation, unicycle_drift
+
+
+@final
+@games.register("lane_change")
+class LaneChange(ControlAffineGame):
+    """Unicycles (px, py, psi, v) with different target lanes; controls (angular velocity, acceleration).
+
+    Args:
+        lanes: lateral positions that players 1 and 2 aim for, m.
+        speed: nominal speed, m/s.
+        radius: collision radius at theta = 0, m.
+        horizon: length of the game, s.
+    """
+
+    roles = (0, 1)
+    lanes: Tensor
+
+    def __init__(
+        self,
+        lanes: tuple[float, float] = (6.0, 2.0),
+        speed: float = 18.0,
+        radius: float = 2.25,
+        horizon: float = 4.0,
+    ) -> None:
+        super().__init__()
+        self.speed, self.radius, self.horizon = speed, radius, horizon
+        self.register_buffer("lanes", torch.tensor(lanes))
+        self.state_box = Box([[0, 0, -0.17, 17], [0, 2, -0.15, 17]], [[90, 6, 0.15, 26], [90, 8, 0.17, 26]])
+        self.initial_box = Box(
+            [[0, 1.25, -DEGREE, 18], [0, 5.25, -DEGREE, 18]], [[3, 2.75, DEGREE, 25], [3, 6.75, DEGREE, 25]]
+        )
+        self.control_box = Box([-1, -5], [1, 10])
+        self.type_box = Box([1, 1], [5, 5])
+        self.register_buffer("input_matrix", torch.eye(4)[:, 2:])
+        self.register_buffer("effort_weight", torch.tensor([100.0, 1.0]))
+
+    def drift(self, x: Tensor) -> Tensor:
+        """Motion at zero control, (B, 2, 4)."""
+        return unicycle_drift(x)
+
+    def terminal_value(self, x: Tensor) -> Tensor:
+        """Reach the other lane, straight and at nominal speed, (B, 2)."""
+        along, across, heading, speed = x.unbind(-1)
+        miss = (across - self.lanes).square() + (speed - self.speed).square() + 100 * heading.square()
+        return 1e-6 * along - miss
+
+    def constraint(self, x: Tensor, theta: Tensor) -> Tensor:
+        """Collision radius minus distance, m, (B, 2)."""
+        return collision_radius(theta, self.radius) - separation(self.positions(x))
+
+    def sensors(self, theta: Tensor) -> Tensor:
+        """Violation set along the distance axis, every 0.05 m, (B, 2, 40)."""
+        return lattice_indicator(collision_radius(theta, self.radius), self.radius - 0.25, 0.05, 40)

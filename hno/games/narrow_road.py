@@ -1,0 +1,59 @@
+"""Two cars meet head-on on a narrow road (paper, case 1)."""
+
+from __future__ import annotations
+
+from typing import final
+
+import torch
+from torch import Tensor
+
+from hno.games.base import Box, ControlAffineGame, games, lattice_indicator
+from hno.games.kinematics import DEGREE, collision_radius, separation, unicycle_drift
+
+
+@final
+@games.register("narrow_road")
+class NarrowRoad(ControlAffineGame):
+    """Unicycles (px, py, psi, v), each driving towards the other; controls (angular velocity, acceleration).
+
+    Args:
+        length: distance between the origins of the two players' frames, m.
+        lane: lateral position that the terminal cost asks for, m.
+        speed: nominal speed, m/s.
+        radius: collision radius at theta = 0, m.
+        horizon: length of the game, s.
+    """
+
+    def __init__(
+        self, length: float = 70.0, lane: float = 4.0, speed: float = 18.0, radius: float = 1.25, horizon: float = 3.0
+    ) -> None:
+        super().__init__()
+        self.length, self.lane, self.speed, self.radius, self.horizon = length, lane, speed, radius, horizon
+        self.state_box = Box([[15, 0, -0.2, 18]] * 2, [[95, 8, 0.2, 29]] * 2)
+        self.initial_box = Box([[15, 3.25, -DEGREE, 18]] * 2, [[20, 4.75, DEGREE, 25]] * 2)
+        self.control_box = Box([-1, -5], [1, 10])
+        self.type_box = Box([1, 1], [5, 5])
+        self.register_buffer("input_matrix", torch.eye(4)[:, 2:])
+        self.register_buffer("effort_weight", torch.tensor([100.0, 1.0]))
+
+    def drift(self, x: Tensor) -> Tensor:
+        """Motion at zero control, (B, 2, 4)."""
+        return unicycle_drift(x)
+
+    def positions(self, x: Tensor) -> Tensor:
+        """Player 2's px runs from the other end of the road, m, (B, 2, 2)."""
+        along, across = x[..., 0], x[..., 1]
+        return torch.stack([torch.stack([along[..., 0], self.length - along[..., 1]], -1), across], -1)
+
+    def terminal_value(self, x: Tensor) -> Tensor:
+        """Stay in the lane at nominal speed, (B, 2)."""
+        along, across, _, speed = x.unbind(-1)
+        return 1e-6 * along - (speed - self.speed).square() - (across - self.lane).square()
+
+    def constraint(self, x: Tensor, theta: Tensor) -> Tensor:
+        """Collision radius minus distance, m, (B, 2)."""
+        return collision_radius(theta, self.radius) - separation(self.positions(x))
+
+    def sensors(self, theta: Tensor) -> Tensor:
+        """Violation set along the distance axis, every 0.05 m, (B, 2, 50)."""
+        return lattice_indicator(collision_radius(theta, self.radius), self.radius - 0.25, 0.05, 50)

@@ -1,0 +1,109 @@
+"""Tuples that fix every shape of the package.
+
+P players, n states and m controls per player, K time nodes, any leading batch shape B.
+Quantities are in physical units; `tau` is time to go (0 is terminal), `t` runs forward.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import NamedTuple
+
+from torch import Tensor
+
+
+class Points(NamedTuple):
+    """Where a value function is asked: time to go, joint state, player types."""
+
+    tau: Tensor
+    """Time to go, s, shape (B,)."""
+    x: Tensor
+    """Joint state, shape (B, P, n)."""
+    theta: Tensor
+    """Player types, shape (B, P)."""
+
+
+class Labels(NamedTuple):
+    """What an operator is supervised with, at the points of the same row."""
+
+    value: Tensor
+    """V_i = -J_i, shape (B, P)."""
+    costate: Tensor
+    """dV_i / dx_j, shape (B, P, P, n)."""
+
+
+class Field(NamedTuple):
+    """A value function and its derivatives at some points."""
+
+    value: Tensor
+    """V_i, shape (B, P)."""
+    dvalue_dtau: Tensor
+    """Derivative in time to go, 1/s, shape (B, P)."""
+    costate: Tensor
+    """dV_i / dx_j, shape (B, P, P, n)."""
+
+
+class Sample(NamedTuple):
+    """One stream of a training batch: points, and labels where the stream has them."""
+
+    points: Points
+    labels: Labels | None = None
+
+
+Batch = dict[str, Sample]
+"""A training batch: stream name -> sample."""
+
+
+class Status(IntEnum):
+    """How a boundary value problem ended."""
+
+    CONVERGED = 0
+    STALLED = 1
+    """The damped Newton step could not reduce the residual further."""
+    MAX_STEPS = 2
+    """The step budget ran out while the residual was still falling."""
+    NOT_FINITE = 3
+    """The states left the region where the game's functions are finite."""
+
+
+class Extremal(NamedTuple):
+    """Trajectories that satisfy Pontryagin's conditions (paper, eq. 4), on a common time grid.
+
+    A trajectory whose `status` is not `Status.CONVERGED` holds the last iterate and must not be used as a label.
+    """
+
+    status: Tensor
+    """`Status` of each trajectory, int64, shape (B,)."""
+    residual: Tensor
+    """Largest scaled collocation residual, shape (B,)."""
+    t: Tensor
+    """Time nodes, s, shape (K,)."""
+    x: Tensor
+    """States, shape (B, K, P, n)."""
+    costate: Tensor
+    """dV_i / dx_j along the trajectory, shape (B, K, P, P, n)."""
+    u: Tensor
+    """Controls, shape (B, K, P, m)."""
+    value: Tensor
+    """V_i from t to the end, shape (B, K, P)."""
+    theta: Tensor
+    """Player types, shape (B, P)."""
+    clearance: Tensor
+    """Smallest -constraint over players and time, between the nodes too, m for distance constraints, shape (B,)."""
+    alternatives: Tensor
+    """Sum of values of every start that was tried, NaN where it did not converge, shape (B, starts)."""
+
+
+class Trajectory(NamedTuple):
+    """A closed-loop simulation, on a common time grid."""
+
+    t: Tensor
+    """Time nodes, s, shape (K,)."""
+    x: Tensor
+    """States, shape (B, K, P, n)."""
+    u: Tensor
+    """Controls, held from each node to the next, shape (B, K - 1, P, m)."""
+    value: Tensor
+    """Minus the cost of the whole episode, shape (B, P)."""
+    clearance: Tensor
+    """Smallest -constraint over players and time, between the nodes too, shape (B,)."""
