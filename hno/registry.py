@@ -72,6 +72,17 @@ class Registry(Generic[T]):
             raise UnknownNameError(unknown_name(self.kind, name, self.names()))
         return self._classes[name]
 
+    def name_of(self, cls: type[T]) -> str:
+        """The name a class is filed under.
+
+        Raises:
+            UnknownNameError: it is not registered.
+        """
+        for name in self.names():
+            if self._classes[name] is cls:
+                return name
+        raise UnknownNameError(f"{cls.__qualname__} is not a registered {self.kind}. Known: {', '.join(self.names())}.")
+
     def _discover(self) -> None:
         if self._discovered:
             return

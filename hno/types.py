@@ -107,3 +107,5 @@ class Trajectory(NamedTuple):
     """Minus the cost of the whole episode, shape (B, P)."""
     clearance: Tensor
     """Smallest -constraint over players and time, between the nodes too, shape (B,)."""
+    distance: Tensor
+    """Smallest distance between two players over time, m, shape (B,)."""

@@ -12,4 +12,6 @@ def make(name: str, **constants: float) -> Game:
         UnknownNameError: no game has that name.
         TypeError: the game has no such constant.
     """
-    return games.get(name)(**constants)
+    game = games.get(name)(**constants)
+    game.constants = dict(constants)
+    return game

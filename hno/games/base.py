@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import abc
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 
 import torch
 from torch import Tensor, nn
@@ -71,6 +72,8 @@ class Game(nn.Module, abc.ABC):
     Methods accept any leading batch shape and both float32 and float64.
     """
 
+    constants: Mapping[str, float] = MappingProxyType({})
+    """Constructor arguments that differ from the defaults."""
     horizon: float
     """Length of the game, s."""
     label_step: float = 0.1

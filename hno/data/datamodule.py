@@ -1,0 +1,191 @@
+"""The streams of training batches, each a pure function of (seed, step)."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import lightning as L
+import torch
+from torch import Tensor
+from torch.utils.data import DataLoader, IterableDataset
+
+from hno.data.curriculum import Curriculum
+from hno.data.generate import Progress, Request, labels_for
+from hno.data.sampling import check_shares, sample_states
+from hno.games import Game
+from hno.pontryagin.solve import Solver
+from hno.types import Batch, Extremal, Labels, Points, Sample, Status
+
+
+class Rows(NamedTuple):
+    """Nodes of labelled trajectories, one per row, float32."""
+
+    points: Points
+    """(R,), (R, P, n), (R, P)."""
+    labels: Labels
+    """(R, P), (R, P, P, n)."""
+
+    @property
+    def size(self) -> int:
+        """Number of rows."""
+        return len(self.points.tau)
+
+    def at(self, index: Tensor) -> Sample:
+        """Rows as a sample."""
+        return Sample(Points(*(part[index] for part in self.points)), Labels(*(part[index] for part in self.labels)))
+
+
+class NoLabelsError(RuntimeError):
+    """Not a single label could be solved."""
+
+
+def rows_of(game: Game, extremals: Sequence[Extremal]) -> Rows:
+    """Every node of every converged trajectory.
+
+    Raises:
+        NoLabelsError: none converged.
+    """
+    good = [e.status == Status.CONVERGED for e in extremals]
+    if not any(bool(mask.any()) for mask in good):
+        raise NoLabelsError(
+            f"None of {sum(len(mask) for mask in good)} boundary value problems of {type(game).__name__} converged, "
+            "so there is nothing to learn from. Check the game with hno.games.testing.check_game."
+        )
+    columns = zip(*(_columns(game, e, mask) for e, mask in zip(extremals, good, strict=True)), strict=True)
+    tau, x, theta, value, costate = (torch.cat(column).float() for column in columns)
+    return Rows(Points(tau, x, theta), Labels(value, costate))
+
+
+def _columns(game: Game, found: Extremal, good: Tensor) -> tuple[Tensor, ...]:
+    count, nodes = int(good.sum()), len(found.t)
+    tau = (game.horizon - found.t).expand(count, -1)
+    theta = found.theta[good].unsqueeze(1).expand(-1, nodes, -1)
+    return tuple(part.flatten(0, 1) for part in (tau, found.x[good], theta, found.value[good], found.costate[good]))
+
+
+class GameData(L.LightningDataModule):
+    """Labelled rows and collocation points of one game.
+
+    Only the streams in `streams` are built. Labels are solved where the cache lacks them.
+
+    Args:
+        game: the game.
+        streams: stream names, of `hno.losses.STREAMS`.
+        types: player types with labels.
+        trajectories: labelled trajectories per type.
+        cache: folder of label files.
+        seed: of start states, batches and collocation points.
+        batch_sizes: rows per step of each stream.
+        curriculum: when collocation begins and how the window widens.
+        shares: where interior points come from, see `hno.data.sampling.SOURCES`.
+        interior_types: "labelled" draws the types of collocation points among `types`, "box" from the type box.
+        validation: trajectories per type that are held out.
+        solver: settings of the label solver.
+        workers: label processes; the number of cores by default.
+        progress: called as labels are solved.
+    """
+
+    def __init__(
+        self,
+        game: Game,
+        streams: Collection[str],
+        types: Sequence[Sequence[float]],
+        trajectories: int,
+        cache: Path,
+        seed: int,
+        batch_sizes: Mapping[str, int],
+        curriculum: Curriculum,
+        shares: Mapping[str, float],
+        interior_types: str = "labelled",
+        validation: int = 8,
+        solver: Solver = Solver(),
+        workers: int | None = None,
+        progress: Progress | None = None,
+    ) -> None:
+        super().__init__()
+        check_shares(shares)
+        if interior_types not in ("labelled", "box"):
+            raise ValueError(f"interior_types must be 'labelled' or 'box'; got {interior_types!r}.")
+        sizes = {"trajectories": trajectories, "validation": validation, **batch_sizes}
+        for name, size in sizes.items():
+            if size < 1:
+                raise ValueError(f"data.{name} must be at least 1; got {size}.")
+        self.game, self.streams, self.seed = game, frozenset(streams), seed
+        self.types = torch.tensor([tuple(map(float, t)) for t in types])
+        self.batch_sizes, self.curriculum, self.shares = dict(batch_sizes), curriculum, dict(shares)
+        self.interior_types, self.cache, self.solver, self.workers = interior_types, cache, solver, workers
+        self.progress = progress
+        self.requests = [
+            Request(tuple(map(float, t)), count, label_seed)
+            for count, label_seed in ((trajectories, 2 * seed), (validation, 2 * seed + 1))
+            for t in types
+        ]
+        self.label_seconds = 0.0
+        self.extremals: list[Extremal] = []
+
+    def prepare_data(self) -> None:
+        """Solve what the cache lacks."""
+        arguments = self.game, self.requests, self.cache, self.solver, self.workers, self.progress
+        self.extremals, self.label_seconds = labels_for(*arguments)
+
+    def setup(self, stage: str) -> None:
+        """Load labels into memory."""
+        if not self.extremals:
+            self.extremals, _ = labels_for(self.game, self.requests, self.cache, self.solver, self.workers)
+        types = len(self.types)
+        self.train_rows = rows_of(self.game, self.extremals[:types])
+        self.val_rows = rows_of(self.game, self.extremals[types:])
+
+    def batch(self, step: int) -> Batch:
+        """The batch of one step, a pure function of (seed, step, rank)."""
+        rank = self.trainer.global_rank if self.trainer is not None else 0
+        generator = torch.Generator().manual_seed(_mix(self.seed, step, rank))
+        batch: Batch = {}
+        if "bvp" in self.streams:
+            chosen = torch.randint(self.train_rows.size, (self.batch_sizes["bvp"],), generator=generator)
+            batch["bvp"] = self.train_rows.at(chosen)
+        if self.curriculum.active(step):
+            for name in sorted(self.streams & {"interior", "terminal"}):
+                batch[name] = Sample(self._points(name, self.curriculum.window(step), generator))
+        return batch
+
+    def _points(self, stream: str, window: float, generator: torch.Generator) -> Points:
+        size = self.batch_sizes[stream]
+        if self.interior_types == "box":
+            theta = self.game.type_box.sample(size, generator)
+        else:
+            theta = self.types[torch.randint(len(self.types), (size,), generator=generator)]
+        labelled = self.train_rows.points.tau, self.train_rows.points.x
+        points = sample_states(self.game, theta, self.shares, labelled, window, generator)
+        return points._replace(tau=torch.zeros_like(points.tau)) if stream == "terminal" else points
+
+    def train_dataloader(self) -> DataLoader[Batch]:
+        """Batches from the trainer's current step on, without end."""
+        first = self.trainer.global_step if self.trainer is not None else 0
+        return DataLoader(_Steps(self, first), batch_size=None)
+
+    def val_dataloader(self) -> DataLoader[Sample]:
+        """Held-out labelled rows, in one batch."""
+        whole = self.val_rows.at(torch.arange(self.val_rows.size))
+        return DataLoader([whole], batch_size=None)  # type: ignore[arg-type] - a list is a map-style dataset
+
+
+class _Steps(IterableDataset[Batch]):
+    def __init__(self, data: GameData, first: int) -> None:
+        self.data, self.first = data, first
+
+    def __iter__(self) -> Iterator[Batch]:
+        step = self.first
+        while True:
+            yield self.data.batch(step)
+            step += 1
+
+
+def _mix(*numbers: int) -> int:
+    """One generator seed from several counters, without collisions for counters below 2^20."""
+    mixed = 0
+    for number in numbers:
+        mixed = (mixed << 20) + number + 1
+    return mixed % (2**63 - 1)

@@ -1,0 +1,92 @@
+"""Label files: safetensors with verified content, written whole or not at all."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import safetensors
+import safetensors.torch
+import torch
+from torch import Tensor
+
+from hno.types import Extremal
+
+FORMAT = 1
+"""Version of the file layout."""
+KEY = "hno"
+"""The metadata key that holds the canonical JSON."""
+
+
+class LabelFileError(RuntimeError):
+    """A label file that is damaged, foreign or of another format."""
+
+
+def canonical_json(content: Mapping[str, Any]) -> str:
+    """JSON with sorted keys and no spaces, equal for equal content."""
+    return json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)
+
+
+def write_labels(path: Path, labels: Extremal, provenance: Mapping[str, Any]) -> None:
+    """Write a label file under a temporary name, then rename it into place.
+
+    Args:
+        path: where; an existing file is replaced only by a complete one.
+        labels: extremals of one game.
+        provenance: how they were made, JSON content.
+    """
+    tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in labels._asdict().items()}
+    header = {"format": FORMAT, "sha256": _digest(tensors), "provenance": dict(provenance)}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    os.close(handle)
+    try:
+        safetensors.torch.save_file(tensors, temporary, metadata={KEY: canonical_json(header)})
+        os.replace(temporary, path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+def read_labels(path: Path) -> tuple[Extremal, dict[str, Any]]:
+    """Read and verify a label file.
+
+    Returns:
+        The extremals and their provenance.
+
+    Raises:
+        LabelFileError: not a label file, another format, or its content does not match its checksum.
+    """
+    try:
+        with safetensors.safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
+    except (safetensors.SafetensorError, OSError) as error:
+        raise LabelFileError(f"{path} cannot be read as a label file ({error}). {_ADVICE}") from error
+    try:
+        header = json.loads(metadata[KEY])
+        found = header["format"], header["sha256"], header["provenance"]
+    except (KeyError, ValueError, TypeError) as error:
+        raise LabelFileError(f"{path} is a safetensors file without hno's metadata. {_ADVICE}") from error
+    if found[0] != FORMAT or set(tensors) != set(Extremal._fields):
+        raise LabelFileError(f"{path} has format {found[0]}, expected {FORMAT}. {_ADVICE}")
+    if found[1] != _digest(tensors):
+        raise LabelFileError(f"{path} is damaged: its content does not match its checksum. {_ADVICE}")
+    return Extremal(**tensors), found[2]
+
+
+_ADVICE = "Move it away and run again; the labels are then solved anew."
+
+
+def _digest(tensors: Mapping[str, Tensor]) -> str:
+    digest = hashlib.sha256()
+    for name in sorted(tensors):
+        tensor = tensors[name]
+        digest.update(f"{name}:{tensor.dtype}:{tuple(tensor.shape)};".encode())
+        digest.update(tensor.contiguous().view(torch.uint8).numpy().tobytes())
+    return digest.hexdigest()

@@ -1,0 +1,52 @@
+"""Terms of the Hamilton-Jacobi-Isaacs equation and its boundary condition (paper, eq. 3 and 6)."""
+
+from __future__ import annotations
+
+from typing import final
+
+from torch import Tensor
+
+from hno.games import Game
+from hno.losses.base import LossTerm, Scales, losses
+from hno.types import Field, Points, Sample
+
+
+def hji_residual(game: Game, points: Points, field: Field) -> Tensor:
+    """HJI residual dV/dtau - max_u H of every player, (B, P).
+
+    Zero for an exact equilibrium value (paper, eq. 3, in time to go).
+    """
+    u = game.optimal_control(points.x, field.costate)
+    return field.dvalue_dtau - game.hamiltonian(points.x, field.costate, u, points.theta)
+
+
+@final
+@losses.register("residual")
+class HJIResidual(LossTerm):
+    """The HJI residual at collocation points inside the time window."""
+
+    stream = "interior"
+
+    def residual(self, game: Game, sample: Sample, field: Field) -> Tensor:
+        """(B, P), 1/s."""
+        return hji_residual(game, sample.points, field)
+
+    def scale(self, game: Game, scales: Scales) -> Tensor:
+        """Size of values, per horizon."""
+        return scales.value / game.horizon
+
+
+@final
+@losses.register("boundary")
+class Boundary(LossTerm):
+    """Terminal condition V(0, x) = -g(x) in reward form."""
+
+    stream = "terminal"
+
+    def residual(self, game: Game, sample: Sample, field: Field) -> Tensor:
+        """(B, P)."""
+        return field.value - game.terminal_value(sample.points.x)
+
+    def scale(self, game: Game, scales: Scales) -> Tensor:
+        """Size of values."""
+        return scales.value

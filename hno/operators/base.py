@@ -1,0 +1,164 @@
+"""The value operator: a LightningModule around a DeepONet that takes and returns physical units."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, ClassVar
+
+import lightning as L
+import torch
+from torch import Tensor, nn
+
+from hno.games import Game, games
+from hno.losses import LossTerm, Norm, Scales
+from hno.operators.deeponet import DeepONet
+from hno.registry import Registry
+from hno.types import Batch, Field, Points
+
+operators: Registry[ValueOperator] = Registry("operator", "hno.operators")
+
+SPEC_KEY = "hno"
+"""Checkpoint entry that says how to build the operator."""
+SPEC_FORMAT = 1
+"""Version of that entry."""
+
+Optimizer = Callable[[Iterable[nn.Parameter]], Mapping[str, Any]]
+"""Builds what Lightning's `configure_optimizers` returns."""
+
+
+class ValueOperator(L.LightningModule, abc.ABC):
+    """V(tau, x, theta) of every player, from one network that sees the game ego-first.
+
+    A subclass is a list of loss terms; everything else is shared.
+
+    Args:
+        game: the game.
+        activation: registered name.
+        weights: weight of each term by name; terms that are not named weigh 0, names without a term are ignored, so
+            that one list serves every operator.
+        norm: pointwise norm of the residuals, see `Norm`.
+        width: hidden and output width of trunk and branch.
+        depth: hidden layers of trunk and branch.
+        optimizer: needed for training only.
+    """
+
+    terms: ClassVar[Mapping[str, type[LossTerm]]]
+    value_scale: Tensor
+    costate_scale: Tensor
+
+    def __init__(
+        self,
+        game: Game,
+        activation: str = "tanh",
+        weights: Mapping[str, float] | None = None,
+        norm: str = "l1",
+        width: int = 64,
+        depth: int = 4,
+        optimizer: Optimizer | None = None,
+    ) -> None:
+        super().__init__()
+        self.options = {"activation": activation, "width": width, "depth": depth}
+        self.game = game
+        self.optimizer = optimizer
+        self.norm = Norm(norm)
+        self.losses = nn.ModuleDict({name: term() for name, term in self.terms.items()})
+        self.weights = {name: float(w) for name, w in (weights or dict.fromkeys(self.terms, 1.0)).items() if name in self.terms}
+        players, states = game.players, game.state_dim
+        self.has_roles = len(set(game.roles)) > 1
+        sensors = game.sensors((game.type_box.lo + game.type_box.hi) / 2).shape[-1]
+        self.net = DeepONet(1 + players * states + self.has_roles, sensors, activation, width, depth)
+        self.register_buffer("value_scale", torch.tensor(1.0))
+        self.register_buffer("costate_scale", torch.ones(players, players, states))
+
+    @property
+    def streams(self) -> frozenset[str]:
+        """Data streams that the weighted terms read."""
+        return frozenset(term.stream for name, term in self.terms.items() if self.weights.get(name, 0) > 0)
+
+    def set_scales(self, scales: Scales) -> None:
+        """Fix the sizes in which outputs and residuals are measured; they are saved with the weights."""
+        self.value_scale.copy_(scales.value)
+        self.costate_scale.copy_(scales.costate)
+
+    def forward(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
+        """V_i, (B,), (B, P, n), (B, P) -> (B, P)."""
+        return self._value(tau.unsqueeze(-1).expand_as(theta), ego_views(self.game.state_box.scale(x)), theta)
+
+    def field(self, points: Points, *, create_graph: bool = False) -> Field:
+        """Value, time derivative and every costate, in one forward and one backward pass for all players.
+
+        Args:
+            points: where, physical units.
+            create_graph: keep the result differentiable in the parameters.
+        """
+        with torch.enable_grad():
+            tau = points.tau.unsqueeze(-1).expand_as(points.theta).detach().requires_grad_()
+            views = ego_views(self.game.state_box.scale(points.x)).detach().requires_grad_()
+            value = self._value(tau, views, points.theta)
+            slope, per_view = torch.autograd.grad(value.sum(), (tau, views), create_graph=create_graph)
+        costate = ego_views(per_view, inverse=True) * 2 / self.game.state_box.width
+        return Field(value if create_graph else value.detach(), slope, costate)
+
+    def _value(self, tau: Tensor, views: Tensor, theta: Tensor) -> Tensor:
+        """V_i from each player's own time (B, P), scaled view (B, P, P, n) and the types (B, P)."""
+        inputs = [2 * tau.unsqueeze(-1) / self.game.horizon - 1, views.flatten(-2)]
+        if self.has_roles:
+            roles = torch.tensor(self.game.roles, dtype=views.dtype, device=views.device)
+            inputs.append(roles.expand_as(tau).unsqueeze(-1))
+        distinct, which = theta.reshape(-1, theta.shape[-1]).unique(dim=0, return_inverse=True)
+        player = torch.arange(theta.shape[-1], device=theta.device)
+        branch = (which.unsqueeze(-1) * len(player) + player).flatten()
+        raw = self.net(torch.cat(inputs, -1).flatten(0, -2), self.game.sensors(distinct).flatten(0, 1), branch)
+        return raw.view_as(tau) * self.value_scale
+
+    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        """Weighted sum of the norms of the terms whose stream is in the batch."""
+        samples = {name: batch[name] for name in sorted(self.streams & batch.keys())}
+        sizes = [len(sample.points.tau) for sample in samples.values()]
+        points = Points(*(torch.cat(parts) for parts in zip(*(s.points for s in samples.values()), strict=True)))
+        field = self.field(points, create_graph=True)
+        fields = dict(zip(samples, (Field(*part) for part in zip(*(f.split(sizes) for f in field), strict=True)), strict=True))
+        scales = Scales(self.value_scale, self.costate_scale)
+        losses: dict[str, Tensor] = {}
+        for name, term in self.losses.items():
+            if term.stream in samples and self.weights.get(name, 0) > 0:
+                residual = term.residual(self.game, samples[term.stream], fields[term.stream])
+                losses[name] = self.norm(residual / term.scale(self.game, scales))
+        total = torch.stack([self.weights[name] * loss for name, loss in losses.items()]).sum()
+        self.log_dict({f"loss/{name}": loss.detach() for name, loss in losses.items()})
+        self.log("loss/total", total.detach(), prog_bar=True)
+        return total
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Add what `hno.operators.checkpoint` needs to rebuild the operator."""
+        checkpoint[SPEC_KEY] = {
+            "format": SPEC_FORMAT,
+            "game": games.name_of(type(self.game)),
+            "constants": dict(self.game.constants),
+            "fingerprint": self.game.fingerprint(),
+            "operator": operators.name_of(type(self)),
+            "options": self.options,
+        }
+
+    def configure_optimizers(self) -> Any:
+        """What the `optimizer` argument builds."""
+        if self.optimizer is None:
+            raise ValueError("This operator was built without an optimizer; pass one to train it.")
+        return self.optimizer(self.net.parameters())
+
+
+def ego_views(x: Tensor, *, inverse: bool = False) -> Tensor:
+    """Each player's view of a joint quantity, itself first.
+
+    Args:
+        x: (B, P, n), or (B, P, P, n) with one copy per player already (needed for the inverse).
+        inverse: turn views back into the common order.
+
+    Returns:
+        (B, P, P, n); entry [..., i, j, :] is player (i + j) mod P, or its inverse.
+    """
+    players = x.shape[-2]
+    if not inverse:
+        return torch.stack([x.roll(-i, -2) for i in range(players)], -3)
+    return torch.stack([x[..., i, :, :].roll(i, -2) for i in range(players)], -3)

@@ -1,0 +1,89 @@
+"""From a checkpoint to an operator or a policy, without executing anything in the file."""
+
+from __future__ import annotations
+
+import pickle
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from hno.games import Game, make
+from hno.operators.base import SPEC_FORMAT, SPEC_KEY, ValueOperator, operators
+from hno.types import Points
+
+
+class CheckpointError(RuntimeError):
+    """A file that is not a readable checkpoint of this package, or is one of another game."""
+
+
+def read_checkpoint(path: str | Path) -> dict[str, Any]:
+    """The content of a checkpoint; only tensors and plain containers are unpickled.
+
+    Raises:
+        CheckpointError: no such file, truncated, or not written by this package.
+    """
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except FileNotFoundError as error:
+        raise CheckpointError(f"There is no checkpoint at {path}. Train one with `python train.py`.") from error
+    except (RuntimeError, OSError, EOFError, pickle.UnpicklingError, zipfile.BadZipFile, KeyError, ValueError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise CheckpointError(f"{path} is not a readable checkpoint: truncated, foreign or unsafe ({reason}).") from error
+    spec = content.get(SPEC_KEY) if isinstance(content, dict) else None
+    if not isinstance(spec, dict) or spec.get("format") != SPEC_FORMAT or "state_dict" not in content:
+        raise CheckpointError(f"{path} was not written by this version of hno: it lacks the entry {SPEC_KEY!r}.")
+    return content
+
+
+def load_operator(path: str | Path, game: str | None = None) -> ValueOperator:
+    """The trained operator in a checkpoint, in evaluation mode.
+
+    Args:
+        path: a checkpoint that training wrote.
+        game: the name of the game that it must be of; any, by default.
+
+    Raises:
+        CheckpointError: see `read_checkpoint`; or the checkpoint is of another game, or its game has changed since.
+        UnknownNameError: its game or operator is not registered here.
+    """
+    content = read_checkpoint(path)
+    spec = content[SPEC_KEY]
+    if game is not None and spec["game"] != game:
+        raise CheckpointError(f"{path} is a checkpoint of game {spec['game']!r}, expected {game!r}.")
+    built = make(spec["game"], **spec["constants"])
+    if built.fingerprint() != spec["fingerprint"]:
+        raise CheckpointError(f"{path} was trained on another version of the game {spec['game']!r}. Train it again.")
+    operator = operators.get(spec["operator"])(built, **spec["options"])
+    try:
+        operator.load_state_dict(content["state_dict"])
+    except RuntimeError as error:
+        raise CheckpointError(f"{path} does not hold the weights that its own entry {SPEC_KEY!r} describes.") from error
+    return operator.eval().requires_grad_(False)
+
+
+class OperatorPolicy:
+    """Feedback controls of every player: the maximiser of the Hamiltonian at the operator's costates.
+
+    Args:
+        operator: a trained operator.
+    """
+
+    def __init__(self, operator: ValueOperator) -> None:
+        self.operator = operator
+
+    @property
+    def game(self) -> Game:
+        """The game that the policy plays."""
+        return self.operator.game
+
+    def __call__(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
+        """Controls in physical units, (B,), (B, P, n), (B, P) -> (B, P, m)."""
+        return self.game.optimal_control(x, self.operator.field(Points(tau, x, theta)).costate)
+
+
+def load_policy(path: str | Path) -> OperatorPolicy:
+    """The policy of the operator in a checkpoint. Raises as `load_operator`."""
+    return OperatorPolicy(load_operator(path))

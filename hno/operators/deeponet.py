@@ -1,0 +1,61 @@
+"""A DeepONet in dimensionless units (paper, eq. 7)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from hno.operators.activations import activations
+
+
+class MLP(nn.Module):
+    """Fully connected net with one activation object, hence one trainable slope.
+
+    Args:
+        sizes: input, hidden and output widths.
+        activation: registered name.
+    """
+
+    def __init__(self, sizes: tuple[int, ...], activation: str) -> None:
+        super().__init__()
+        self.activation = activations.get(activation)()
+        self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in zip(sizes[:-1], sizes[1:], strict=True))
+        for index, layer in enumerate(self.layers):
+            self.activation.init_(layer, first=index == 0)
+
+    def forward(self, z: Tensor) -> Tensor:
+        """(..., inputs) -> (..., outputs), the last layer linear."""
+        for layer in self.layers[:-1]:
+            z = self.activation(layer(z))
+        return self.layers[-1](z)
+
+
+class DeepONet(nn.Module):
+    """sum_k branch_k(a) trunk_k(y).
+
+    Args:
+        trunk_inputs: size of y, scaled time and states.
+        sensors: size of the branch input a.
+        activation: registered name, for both nets.
+        width: hidden and output width.
+        depth: hidden layers.
+    """
+
+    def __init__(self, trunk_inputs: int, sensors: int, activation: str, width: int = 64, depth: int = 4) -> None:
+        super().__init__()
+        hidden = (width,) * (depth + 1)
+        self.trunk = MLP((trunk_inputs, *hidden), activation)
+        self.branch = MLP((sensors, *hidden), activation)
+
+    def forward(self, y: Tensor, sensors: Tensor, which: Tensor) -> Tensor:
+        """Value at each row.
+
+        Args:
+            y: trunk inputs, (R, trunk_inputs).
+            sensors: distinct branch inputs, (C, S): the branch runs once for each.
+            which: the branch input of each row, (R,).
+
+        Returns:
+            Shape (R,).
+        """
+        return torch.linalg.vecdot(self.trunk(y), self.branch(sensors)[which])
