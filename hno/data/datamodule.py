@@ -58,6 +58,10 @@ def rows_of(game: Game, extremals: Sequence[Extremal]) -> Rows:
     return Rows(Points(tau, x, theta), Labels(value, costate))
 
 
+def _part(found: Extremal, rows: slice) -> Extremal:
+    return Extremal(**{name: part if name == "t" else part[rows] for name, part in found._asdict().items()})
+
+
 def _columns(game: Game, found: Extremal, good: Tensor) -> tuple[Tensor, ...]:
     count, nodes = int(good.sum()), len(found.t)
     tau = (game.horizon - found.t).expand(count, -1)
@@ -113,15 +117,13 @@ class GameData(L.LightningDataModule):
             if size < 1:
                 raise ValueError(f"data.{name} must be at least 1; got {size}.")
         self.game, self.streams, self.seed = game, frozenset(streams), seed
-        self.types = torch.tensor([tuple(map(float, t)) for t in types])
+        self.type_list = [tuple(map(float, theta)) for theta in types]
+        self.types = torch.tensor(self.type_list)
         self.batch_sizes, self.curriculum, self.shares = dict(batch_sizes), curriculum, dict(shares)
         self.interior_types, self.cache, self.solver, self.workers = interior_types, cache, solver, workers
         self.progress = progress
-        self.requests = [
-            Request(tuple(map(float, t)), count, label_seed)
-            for count, label_seed in ((trajectories, 2 * seed), (validation, 2 * seed + 1))
-            for t in types
-        ]
+        self.requests = [Request(theta, trajectories + validation, seed, "train") for theta in self.type_list]
+        self.validation = validation
         self.label_seconds = 0.0
         self.extremals: list[Extremal] = []
 
@@ -134,9 +136,14 @@ class GameData(L.LightningDataModule):
         """Load labels into memory."""
         if not self.extremals:
             self.extremals, _ = labels_for(self.game, self.requests, self.cache, self.solver, self.workers)
-        types = len(self.types)
-        self.train_rows = rows_of(self.game, self.extremals[:types])
-        self.val_rows = rows_of(self.game, self.extremals[types:])
+        held_out = -self.validation
+        self.train_rows = rows_of(self.game, [_part(found, slice(held_out)) for found in self.extremals])
+        self.val_rows = rows_of(self.game, [_part(found, slice(held_out, None)) for found in self.extremals])
+
+    def label_scales(self) -> tuple[Tensor, Tensor]:
+        """Mean absolute value, scalar, and mean absolute costate, (P, P, n), of the training labels."""
+        labels = self.train_rows.labels
+        return labels.value.abs().mean(), labels.costate.abs().mean(0)
 
     def batch(self, step: int) -> Batch:
         """The batch of one step, a pure function of (seed, step, rank)."""

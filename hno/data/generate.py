@@ -31,6 +31,8 @@ class Request(NamedTuple):
     """Number of start states."""
     seed: int
     """Seed of the start states."""
+    split: str
+    """What the states are for, "train" or "test": different splits never share states."""
     widen: float = 1.0
     """Width of the start box in units of the game's."""
 
@@ -47,7 +49,7 @@ def default_cache() -> Path:
 
 def start_states(game: Game, request: Request) -> Tensor:
     """Uniform start states of a request, float64, (count, P, n)."""
-    text = canonical_json({"seed": request.seed, "theta": request.theta})
+    text = canonical_json({"seed": request.seed, "split": request.split, "theta": request.theta})
     generator = torch.Generator().manual_seed(int(hashlib.sha256(text.encode()).hexdigest()[:15], 16))
     return game.initial_box.widened(request.widen).cpu().sample(request.count, generator).double()
 
@@ -100,7 +102,7 @@ def label_path(game: Game, request: Request, cache: Path, settings: Solver) -> P
     """File of a request; its name holds a hash of everything that determines the labels."""
     key = hashlib.sha256(canonical_json(provenance(game, request, settings)).encode()).hexdigest()[:16]
     types = "-".join(f"{t:g}" for t in request.theta)
-    return cache / type(game).__name__ / f"{types}_n{request.count}_s{request.seed}_{key}.safetensors"
+    return cache / type(game).__name__ / f"{types}_{request.split}{request.seed}_n{request.count}_{key}.safetensors"
 
 
 def provenance(game: Game, request: Request, settings: Solver) -> dict[str, Any]:

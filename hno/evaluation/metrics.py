@@ -1,4 +1,4 @@
-"""What is counted: torchmetrics for errors and collisions, exact intervals for rates."""
+"""What is counted: collisions, with exact intervals for their rate."""
 
 from __future__ import annotations
 
@@ -6,28 +6,6 @@ import torch
 from scipy.stats import binomtest
 from torch import Tensor
 from torchmetrics import Metric
-
-
-class RelativeError(Metric):
-    """Sum of absolute deviations over the sum of absolute targets: 0 is perfect, 1 is as bad as predicting 0."""
-
-    full_state_update = False
-    deviation: Tensor
-    size: Tensor
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.add_state("deviation", torch.tensor(0.0, dtype=torch.float64), dist_reduce_fx="sum")
-        self.add_state("size", torch.tensor(0.0, dtype=torch.float64), dist_reduce_fx="sum")
-
-    def update(self, predicted: Tensor, target: Tensor) -> None:
-        """Add tensors of any equal shape."""
-        self.deviation += (predicted - target).abs().sum().double()
-        self.size += target.abs().sum().double()
-
-    def compute(self) -> Tensor:
-        """The ratio."""
-        return self.deviation / self.size
 
 
 class CollisionRate(Metric):

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import abc
 import hashlib
+import math
+import warnings
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 
@@ -13,6 +15,10 @@ from torch import Tensor, nn
 from hno.registry import Registry
 
 games: Registry[Game] = Registry("game", "hno.games")
+
+
+class ExtrapolationWarning(UserWarning):
+    """Player types outside the range that a game is made for."""
 
 
 class Box(nn.Module):
@@ -156,6 +162,24 @@ class Game(nn.Module, abc.ABC):
     def violates(self, x: Tensor, theta: Tensor) -> Tensor:
         """Whether any player's constraint is violated (or just met), shape (B,)."""
         return (self.constraint(x, theta) >= 0).any(-1)
+
+    def validate_types(self, types: Sequence[Sequence[float]]) -> list[tuple[float, ...]]:
+        """Player types as tuples of floats, with an `ExtrapolationWarning` for those outside the type box.
+
+        Raises:
+            ValueError: a type that is not one finite number per player.
+        """
+        checked = []
+        for theta in types:
+            entries = tuple(float(entry) for entry in theta)
+            if len(entries) != self.players or not all(map(math.isfinite, entries)):
+                raise ValueError(f"theta must be {self.players} finite numbers, one per player; got {tuple(theta)}.")
+            if not bool(self.type_box.contains(torch.tensor(entries, device=self.type_box.lo.device))):
+                lo, hi = self.type_box.lo.tolist(), self.type_box.hi.tolist()
+                message = f"theta = {entries} lies outside the types {lo} to {hi} of the game: results extrapolate."
+                warnings.warn(message, ExtrapolationWarning, stacklevel=2)
+            checked.append(entries)
+        return checked
 
     def fingerprint(self) -> str:
         """Hash of the game's boxes and of its functions at fixed points: it changes when the physics does."""

@@ -9,12 +9,13 @@ from typing import Any, ClassVar
 import lightning as L
 import torch
 from torch import Tensor, nn
+from torchmetrics import WeightedMeanAbsolutePercentageError
 
 from hno.games import Game, games
 from hno.losses import LossTerm, Norm, Scales
 from hno.operators.deeponet import DeepONet
 from hno.registry import Registry
-from hno.types import Batch, Field, Points
+from hno.types import Batch, Field, Points, Sample
 
 operators: Registry[ValueOperator] = Registry("operator", "hno.operators")
 
@@ -59,6 +60,7 @@ class ValueOperator(L.LightningModule, abc.ABC):
     ) -> None:
         super().__init__()
         self.options = {"activation": activation, "width": width, "depth": depth}
+        self.seen_types: list[tuple[float, ...]] = []
         self.game = game
         self.optimizer = optimizer
         self.norm = Norm(norm)
@@ -68,6 +70,8 @@ class ValueOperator(L.LightningModule, abc.ABC):
         self.has_roles = len(set(game.roles)) > 1
         sensors = game.sensors((game.type_box.lo + game.type_box.hi) / 2).shape[-1]
         self.net = DeepONet(1 + players * states + self.has_roles, sensors, activation, width, depth)
+        self.value_error = WeightedMeanAbsolutePercentageError()
+        self.costate_error = WeightedMeanAbsolutePercentageError()
         self.register_buffer("value_scale", torch.tensor(1.0))
         self.register_buffer("costate_scale", torch.ones(players, players, states))
 
@@ -75,6 +79,11 @@ class ValueOperator(L.LightningModule, abc.ABC):
     def streams(self) -> frozenset[str]:
         """Data streams that the weighted terms read."""
         return frozenset(term.stream for name, term in self.terms.items() if self.weights.get(name, 0) > 0)
+
+    def names(self) -> dict[str, str]:
+        """Registered names of game, operator and activation."""
+        parts = games.name_of(type(self.game)), operators.name_of(type(self)), self.options["activation"]
+        return dict(zip(("game", "operator", "activation"), map(str, parts), strict=True))
 
     def set_scales(self, scales: Scales) -> None:
         """Fix the sizes in which outputs and residuals are measured; they are saved with the weights."""
@@ -130,6 +139,15 @@ class ValueOperator(L.LightningModule, abc.ABC):
         self.log("loss/total", total.detach(), prog_bar=True)
         return total
 
+    def validation_step(self, sample: Sample, batch_idx: int) -> None:
+        """Weighted absolute percentage errors of values and costates on held-out labels."""
+        if sample.labels is None:
+            raise ValueError("Validation needs labelled rows; this sample has points only.")
+        field = self.field(sample.points)
+        self.value_error(field.value, sample.labels.value)
+        self.costate_error(field.costate.flatten(1), sample.labels.costate.flatten(1))
+        self.log_dict({"val/value_error": self.value_error, "val/costate_error": self.costate_error})
+
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Add what `hno.operators.checkpoint` needs to rebuild the operator."""
         checkpoint[SPEC_KEY] = {
@@ -139,6 +157,7 @@ class ValueOperator(L.LightningModule, abc.ABC):
             "fingerprint": self.game.fingerprint(),
             "operator": operators.name_of(type(self)),
             "options": self.options,
+            "seen_types": self.seen_types,
         }
 
     def configure_optimizers(self) -> Any:

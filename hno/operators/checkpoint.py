@@ -61,6 +61,7 @@ def load_operator(path: str | Path, game: str | None = None) -> ValueOperator:
         operator.load_state_dict(content["state_dict"])
     except RuntimeError as error:
         raise CheckpointError(f"{path} does not hold the weights that its own entry {SPEC_KEY!r} describes.") from error
+    operator.seen_types = [tuple(theta) for theta in spec["seen_types"]]
     return operator.eval().requires_grad_(False)
 
 

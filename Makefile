@@ -1,0 +1,45 @@
+# make train ARGS="game=drone"   make test ARGS="-k hji"   make help
+
+PYTHON ?= python3
+VENV   := .venv
+BIN    := $(VENV)/bin
+STAMP  := $(VENV)/.stamp
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+
+# The stamp holds the path of the checkout and is written last. Without it, with a stamp of another checkout or without
+# an interpreter (interrupted, copied, or Python was upgraded), the environment is built from nothing.
+SOUND := $(shell test -x $(BIN)/python && test "$$(cat $(STAMP) 2>/dev/null)" = "$(CURDIR)" && echo yes)
+ifneq ($(SOUND),yes)
+.PHONY: $(STAMP)
+endif
+
+$(STAMP): pyproject.toml constraints.txt
+	$(if $(SOUND),test -x $(BIN)/python || )$(PYTHON) -m venv --clear $(VENV)
+	@rm -f $@
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev]"
+	@echo "$(CURDIR)" > $@
+
+.PHONY: help
+help: ## list the targets
+	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "%-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+
+.PHONY: train
+train: $(STAMP) ## train and evaluate; overrides in ARGS, e.g. ARGS="game=drone"
+	$(BIN)/python train.py $(ARGS)
+
+.PHONY: lint
+lint: $(STAMP) ## ruff and mypy
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/python -m mypy hno train.py evaluate.py
+
+.PHONY: test
+test: lint ## lint, then the tests that are not slow; more options in ARGS
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 $(ARGS)
+
+.PHONY: clean
+clean: ## remove the environment, caches and builds, but no results
+	rm -rf $(VENV) build dist .mypy_cache .ruff_cache .pytest_cache *.egg-info
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

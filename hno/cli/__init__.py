@@ -1,0 +1,1 @@
+"""The commands: configuration in, objects built, results out."""

@@ -1,0 +1,99 @@
+"""From configuration to objects."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+from omegaconf import DictConfig, OmegaConf
+
+from hno.cli.logs import StepLines, loggers, progress_bar
+from hno.data import GameData
+from hno.data.curriculum import Curriculum
+from hno.data.generate import Progress, default_cache
+from hno.evaluation.callbacks import StopOnDivergence, checkpoints
+from hno.games import Game, make
+from hno.operators import ValueOperator, operators
+from hno.operators.optimizers import make_optimizer
+
+
+def plain(config: DictConfig) -> dict[str, Any]:
+    """A configuration node as plain containers."""
+    content = OmegaConf.to_container(config, resolve=True)
+    assert isinstance(content, dict)
+    return {str(key): value for key, value in content.items()}
+
+
+def build_game(config: DictConfig) -> Game:
+    """The chosen game with its changed constants."""
+    return make(config.game.name, **plain(config.game.constants))
+
+
+def build_operator(config: DictConfig, game: Game) -> ValueOperator:
+    """The chosen operator, ready to train."""
+    options = plain(config.operator)
+    cls = operators.get(options.pop("name"))
+    optimizer = make_optimizer(steps=config.trainer.max_steps, **plain(config.optimizer))
+    return cls(
+        game,
+        activation=config.activation.name,
+        weights=plain(config.loss.weights),
+        norm=config.loss.norm,
+        optimizer=optimizer,
+        **options,
+    )
+
+
+def build_data(config: DictConfig, operator: ValueOperator, progress: Progress | None = None) -> GameData:
+    """The streams that the operator's terms read."""
+    data, steps = config.data, config.trainer.max_steps
+    return GameData(
+        operator.game,
+        streams=operator.streams,
+        types=operator.game.validate_types(data.types),
+        trajectories=data.trajectories,
+        cache=cache_folder(data.cache),
+        seed=config.seed,
+        batch_sizes=plain(data.batch_sizes),
+        curriculum=Curriculum(round(data.pretrain * steps), round(data.widening * steps)),
+        shares=plain(config.sampler),
+        interior_types=data.interior_types,
+        validation=data.validation,
+        workers=data.workers,
+        progress=progress,
+    )
+
+
+def cache_folder(choice: str | None) -> Path:
+    """The folder of label files."""
+    return Path(choice) if choice is not None else default_cache()
+
+
+def build_trainer(config: DictConfig, folder: Path) -> L.Trainer:
+    """A trainer that runs for a number of steps and leaves `last.ckpt` in the folder."""
+    trainer = config.trainer
+    if trainer.max_steps < 1:
+        raise ValueError(f"trainer.max_steps must be at least 1; got {trainer.max_steps}.")
+    callbacks: Sequence[L.Callback] = [
+        checkpoints(folder, trainer.validate_every), StopOnDivergence(), progress_bar() or StepLines(trainer.print_every)
+    ]  # fmt: skip
+    return L.Trainer(
+        accelerator=trainer.accelerator,
+        devices=trainer.devices,
+        precision=trainer.precision,
+        max_steps=trainer.max_steps,
+        max_epochs=-1,
+        gradient_clip_val=trainer.gradient_clip_val,
+        val_check_interval=min(trainer.validate_every, trainer.max_steps),
+        check_val_every_n_epoch=None,
+        num_sanity_val_steps=0,
+        log_every_n_steps=max(1, min(50, trainer.max_steps)),
+        logger=loggers(config, folder),
+        callbacks=list(callbacks),
+        enable_progress_bar=progress_bar() is not None,
+        enable_model_summary=False,
+        default_root_dir=folder,
+        inference_mode=False,
+    )

@@ -1,0 +1,84 @@
+"""Where the configuration lies, what may be chosen, and messages for choices that do not exist."""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import hydra
+from hydra.core.config_store import ConfigStore
+from omegaconf import DictConfig
+
+import hno
+from hno.games import games
+from hno.operators import activations, operators
+from hno.registry import Registry, unknown_name
+
+PLUGGABLE: dict[str, Registry] = {"game": games, "operator": operators, "activation": activations}
+"""Groups whose choices are registered classes."""
+
+
+def config_dir() -> Path:
+    """The folder `conf`: inside an installed package, beside the package in a checkout."""
+    package = Path(hno.__file__).parent
+    found = next((folder for folder in (package / "conf", package.parent / "conf") if folder.is_dir()), None)
+    if found is None:
+        raise FileNotFoundError(f"The configuration folder conf/ is missing beside {package}. Install hno again.")
+    return found
+
+
+def register_plugins() -> None:
+    """Make every registered name a choice of its group, also those without a yaml file."""
+    for group, registry in PLUGGABLE.items():
+        for name in registry.names():
+            if not (config_dir() / group / f"{name}.yaml").exists():
+                node = {"game": {"name": name, "constants": {}}} if group == "game" else {"name": name}
+                package = "_global_" if group == "game" else None
+                ConfigStore.instance().store(group=group, name=name, node=node, package=package)
+
+
+def choices(group: str) -> list[str]:
+    """Choices of a configuration group."""
+    names = {path.stem for path in (config_dir() / group).glob("*.yaml")}
+    return sorted(names | set(PLUGGABLE[group].names() if group in PLUGGABLE else ()))
+
+
+def check_choices(arguments: Sequence[str]) -> None:
+    """Refuse group choices that do not exist, with the known ones and the nearest.
+
+    Raises:
+        SystemExit: a choice does not exist.
+    """
+    groups = {path.name for path in config_dir().iterdir() if path.is_dir()}
+    for argument in arguments:
+        match = re.fullmatch(r"\+?([a-z_]+)=([\w,]+)", argument)
+        if match is None or match[1] not in groups:
+            continue
+        for name in match[2].split(","):
+            if name not in (*choices(match[1]), "null", ""):
+                sys.exit(unknown_name(match[1], name, choices(match[1])))
+
+
+def run_command(config_name: str, task: Callable[[DictConfig], bool]) -> None:
+    """Run a task under Hydra, in every job of a multirun, and exit with 1 if one of them failed.
+
+    Args:
+        config_name: the root configuration.
+        task: does one job; false if it failed (it has said why).
+    """
+    check_choices(sys.argv[1:])
+    sys.argv[1:] = [re.sub(r"^theta=([^'\"]*[,;].*)$", r"theta='\1'", argument) for argument in sys.argv[1:]]
+    register_plugins()
+    outcomes: list[bool] = []
+
+    def job(config: DictConfig) -> None:
+        outcomes.append(task(config))
+
+    try:
+        hydra.main(version_base="1.3", config_path=str(config_dir()), config_name=config_name)(job)()
+    except OSError as error:
+        sys.exit(f"The output folder cannot be written ({error}). Choose another with hydra.run.dir=<folder>.")
+    if not all(outcomes):
+        sys.exit(1)

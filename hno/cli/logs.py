@@ -1,0 +1,132 @@
+"""Loggers, progress and where messages go."""
+
+from __future__ import annotations
+
+import logging
+import os
+import socket
+import sys
+import time
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlparse
+
+import lightning as L
+import wandb
+from lightning.pytorch.callbacks import ProgressBar, RichProgressBar
+from lightning.pytorch.loggers import CSVLogger, Logger, WandbLogger
+from omegaconf import DictConfig, OmegaConf
+
+from hno.data.generate import Progress
+from hno.registry import unknown_name
+
+log = logging.getLogger(__name__)
+
+LOGGERS = ("csv", "wandb")
+
+
+def send_lightning_to_hydra() -> None:
+    """Let Lightning's and Python's warnings reach the root handlers, which Hydra has set to console and file."""
+    logging.captureWarnings(True)
+    for name in ("lightning", "lightning.pytorch", "lightning.fabric"):
+        logger = logging.getLogger(name)
+        logger.handlers.clear()
+        logger.propagate = True
+
+
+def loggers(config: DictConfig, folder: Path) -> list[Logger]:
+    """The chosen loggers.
+
+    Raises:
+        KeyError: unknown logger.
+    """
+    made: list[Logger] = []
+    for name in config.logger.names:
+        if name not in LOGGERS:
+            raise KeyError(unknown_name("logger", name, list(LOGGERS)))
+        if name == "csv":
+            made.append(CSVLogger(folder, name="", version="csv"))
+        elif config.logger.mode != "disabled":
+            made.append(_wandb_logger(config, folder))
+    return made
+
+
+def _wandb_logger(config: DictConfig, folder: Path) -> WandbLogger:
+    mode = wandb_mode(config.logger.mode)
+    return WandbLogger(
+        project=config.logger.project,
+        group=folder.parent.name,
+        name=folder.name,
+        save_dir=folder,
+        offline=mode == "offline",
+        config=OmegaConf.to_container(config, resolve=True),
+    )
+
+
+def wandb_mode(choice: str) -> str:
+    """Resolve "auto": online with a key and a reachable server, otherwise offline, said in one line.
+
+    Raises:
+        ValueError: unknown mode.
+    """
+    known = ("auto", "disabled", "offline", "online")
+    if choice not in known:
+        raise ValueError(f"logger.mode must be one of {', '.join(known)}; got {choice!r}.")
+    choice = os.environ.get("WANDB_MODE", choice) if choice == "auto" else choice
+    if choice != "auto":
+        return choice
+    settings = wandb.Settings()
+    if not (os.environ.get("WANDB_API_KEY") or wandb.api.api_key):
+        log.info("W&B runs offline: no API key. `wandb login` or WANDB_API_KEY makes it online.")
+        return "offline"
+    if not _reachable(settings.base_url):
+        log.info("W&B runs offline: %s cannot be reached. `wandb sync` uploads the run later.", settings.base_url)
+        return "offline"
+    return "online"
+
+
+def _reachable(url: str, seconds: float = 3.0) -> bool:
+    parts = urlparse(url)
+    try:
+        with socket.create_connection((parts.hostname or "", parts.port or 443), timeout=seconds):
+            return True
+    except OSError:
+        return False
+
+
+def label_progress(every: float = 10.0) -> Progress:
+    """A function that logs how many labels are solved, at most one line every so many seconds."""
+    began = last = time.monotonic()
+
+    def say(done: int, total: int) -> None:
+        nonlocal last
+        now = time.monotonic()
+        if now - last >= every or done == total:
+            last = now
+            log.info("labels: %d of %d solved in %.0f s", done, total, now - began)
+
+    return say
+
+
+def progress_bar() -> ProgressBar | None:
+    """A live bar on a terminal, nothing elsewhere."""
+    return RichProgressBar() if sys.stdout.isatty() else None
+
+
+class StepLines(L.Callback):
+    """One line every so many steps, where there is no terminal.
+
+    Args:
+        every: steps between lines.
+    """
+
+    def __init__(self, every: int) -> None:
+        self.every = every
+
+    def on_train_batch_end(
+        self, trainer: L.Trainer, pl_module: L.LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Print the losses."""
+        if trainer.global_step % self.every == 0:
+            losses = ", ".join(f"{k} {float(v):.4g}" for k, v in sorted(trainer.callback_metrics.items()))
+            log.info("step %d of %d: %s", trainer.global_step, trainer.max_steps, losses)

@@ -1,0 +1,75 @@
+"""results.json: what a run was and what came of it, valid even when a part failed."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import platform
+import tempfile
+from collections.abc import Mapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+import hno
+
+SCHEMA = 1
+"""Version of results.json."""
+PACKAGES = ("torch", "lightning", "torchmetrics", "hydra-core", "omegaconf", "wandb", "scipy", "safetensors")
+
+
+def config_hash(config: DictConfig) -> str:
+    """Hash of what determines a run's numbers; folders, logging and the number of workers do not."""
+    content = OmegaConf.to_container(config, resolve=True)
+    assert isinstance(content, dict)
+    for key in ("logger", "resume", "checkpoint"):
+        content.pop(key, None)
+    for group, key in (("data", "cache"), ("data", "workers"), ("trainer", "print_every"), ("trainer", "threads")):
+        content.get(group, {}).pop(key, None)
+    text = json.dumps(content, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def versions() -> dict[str, str]:
+    """Versions of hno, Python and the packages that numbers depend on."""
+    return {"hno": hno.__version__, "python": platform.python_version(), **{name: version(name) for name in PACKAGES}}
+
+
+class Results:
+    """The content of a results.json, written after every part of a run.
+
+    Args:
+        path: the file.
+        head: what is known before the run.
+    """
+
+    def __init__(self, path: Path, head: Mapping[str, Any]) -> None:
+        self.path = path
+        self.content: dict[str, Any] = {
+            "schema": SCHEMA, "status": "running", "reason": None, **head, "seconds": {}, "table": [],
+            "versions": versions(),
+        }  # fmt: skip
+        self.write()
+
+    def update(self, **entries: Any) -> None:
+        """Replace entries and write the file."""
+        self.content.update(entries)
+        self.write()
+
+    def time(self, part: str, seconds: float) -> None:
+        """Record how long a part took and write the file."""
+        self.content["seconds"][part] = round(seconds, 3)
+        self.write()
+
+    def write(self) -> None:
+        """Write under a temporary name, then rename into place."""
+        text = json.dumps(self.content, indent=2, allow_nan=False)
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        handle, temporary = tempfile.mkstemp(dir=self.path.parent, prefix=".results.")
+        with os.fdopen(handle, "w") as file:
+            file.write(text + "\n")
+        Path(temporary).chmod(0o644)
+        Path(temporary).replace(self.path)

@@ -1,0 +1,85 @@
+"""What a run prints at its end."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+log = logging.getLogger(__name__)
+
+COLUMNS = (
+    "theta", "labels", "starts", "safe", "collisions", "rate", "95 % interval", "min distance", "excess cost", "apart"
+)  # fmt: skip
+
+
+def show(results: Mapping[str, Any], folder: Path) -> None:
+    """Print the collision table, the totals and where everything lies."""
+    title = " / ".join(str(results[name]) for name in ("game", "operator", "activation"))
+    table = Table(*COLUMNS, title=title, caption=_caption(results))
+    for row in results["table"]:
+        table.add_row(*_cells(row))
+    console = Console()
+    console.print(table if console.is_terminal else _wide(table))
+    console.print(verdict(results["table"]))
+    spent = ", ".join(f"{part.replace('_', ' ')} {seconds:.0f} s" for part, seconds in results["seconds"].items())
+    console.print(f"Time: {spent}\nResults: {folder / 'results.json'}", soft_wrap=True)
+
+
+def _wide(table: Table) -> Table:
+    table.min_width = 120
+    return table
+
+
+def _caption(results: Mapping[str, Any]) -> str:
+    return (
+        f"safe: equilibrium keeps {100 * results['clearance']:g} cm; apart: unsolved / inevitable / marginal starts; "
+        "distance in m, costs as medians"
+    )
+
+
+def _cells(row: Mapping[str, Any]) -> list[str]:
+    interval = row["interval"]
+    return [
+        ", ".join(f"{t:g}" for t in row["theta"]),
+        "seen" if row["seen"] else "unseen",
+        str(row["starts"]),
+        str(row["safe_starts"]),
+        str(row["collisions"]),
+        percent(row["rate"]),
+        "n/a" if interval is None else f"{percent(interval[0])} to {percent(interval[1])}",
+        number(row["median_min_distance"]),
+        f"{number(row['median_excess_cost'])} of {number(row['median_label_cost'])}",
+        f"{row['unsolved']} / {row['inevitable']} / {row['marginal']}",
+    ]
+
+
+def percent(rate: float | None) -> str:
+    """A rate for people; "n/a" when there was nothing to count."""
+    return "n/a" if rate is None else f"{100 * rate:.2f} %"
+
+
+def number(value: float | None) -> str:
+    """A number for people; "n/a" when there is none."""
+    return "n/a" if value is None else f"{value:.2f}"
+
+
+def verdict(table: Sequence[Mapping[str, Any]]) -> str:
+    """The totals over all types in one sentence."""
+    safe = sum(row["safe_starts"] for row in table)
+    if safe == 0:
+        return "No start has a safe equilibrium: there is no collision rate (n/a)."
+    collisions = sum(row["collisions"] for row in table)
+    worst = max((row for row in table if row["rate"] is not None), key=lambda row: row["rate"])
+    at = ", ".join(f"{t:g}" for t in worst["theta"])
+    return f"{collisions} collisions in {safe} safe starts ({percent(collisions / safe)}); worst {percent(worst['rate'])} at ({at})."
+
+
+def report(error: Exception) -> None:
+    """Log what went wrong: one message for errors that name their remedy, a traceback for surprises."""
+    expected = isinstance(error, (ValueError, KeyError, OSError, RuntimeError))
+    log.error("%s", error, exc_info=None if expected else error)

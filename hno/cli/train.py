@@ -1,0 +1,102 @@
+"""`python train.py`: labels, training, closed-loop evaluation, results."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import lightning as L
+import torch
+import wandb
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+
+from hno.cli.build import build_data, build_game, build_operator, build_trainer
+from hno.cli.config import run_command
+from hno.cli.evaluate import check_evaluation, evaluate_policy
+from hno.cli.logs import label_progress, send_lightning_to_hydra
+from hno.cli.results import Results, config_hash
+from hno.cli.summary import report, show
+from hno.evaluation.closed_loop import TypeRow
+from hno.losses import Scales
+from hno.operators.checkpoint import load_policy, read_checkpoint
+
+log = logging.getLogger(__name__)
+
+
+def main() -> None:
+    """Entry point."""
+    run_command("train", train)
+
+
+def train(config: DictConfig) -> bool:
+    """One run; its folder gets last.ckpt, metrics and results.json.
+
+    Returns:
+        Whether it succeeded. A failure has been logged and is in results.json.
+    """
+    send_lightning_to_hydra()
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    head = {
+        "game": config.game.name,
+        "operator": config.operator.name,
+        "activation": config.activation.name,
+        "seed": config.seed,
+        "steps": config.trainer.max_steps,
+        "config_hash": config_hash(config),
+    }
+    results = Results(folder / "results.json", head)
+    try:
+        _run(config, folder, results)
+    except Exception as error:
+        results.update(status="failed", reason=f"{type(error).__name__}: {error}")
+        report(error)
+        return False
+    finally:
+        wandb.finish(exit_code=int(results.content["status"] != "finished"))
+    show(results.content, folder)
+    return True
+
+
+def _run(config: DictConfig, folder: Path, results: Results) -> None:
+    L.seed_everything(config.seed, verbose=False)
+    if config.trainer.threads is not None:
+        torch.set_num_threads(config.trainer.threads)
+    game = build_game(config)
+    operator = build_operator(config, game)
+    data = build_data(config, operator, label_progress())
+    operator.seen_types = data.type_list
+    types = list(dict.fromkeys(operator.seen_types + game.validate_types(config.evaluation.types)))
+    settings = {name: config.evaluation[name] for name in ("starts", "seed", "clearance", "dt")}
+    check_evaluation(settings["starts"], settings["clearance"], settings["dt"])
+    trainer = build_trainer(config, folder)
+    if config.resume is not None:
+        read_checkpoint(config.resume)
+
+    data.prepare_data()
+    data.setup("fit")
+    results.time("labels", data.label_seconds)
+    operator.set_scales(Scales(*data.label_scales()))
+
+    began = time.perf_counter()
+    trainer.fit(operator, datamodule=data, ckpt_path=config.resume, weights_only=True)
+    results.time("training", time.perf_counter() - began)
+    metrics = {name: float(value) for name, value in trainer.callback_metrics.items()}
+    results.update(steps=trainer.global_step, checkpoint="last.ckpt", metrics=metrics)
+
+    policy = load_policy(folder / "last.ckpt")
+    table = evaluate_policy(policy, types, data.cache, config.data.workers, results, **settings)
+    for logger in trainer.loggers:
+        logger.log_metrics(totals(table), step=trainer.global_step)
+    results.update(status="finished")
+
+
+def totals(table: Sequence[TypeRow]) -> dict[str, float]:
+    """Collision rate over all safe starts and at the worst type; empty without safe starts."""
+    counted = [row for row in table if row.rate is not None]
+    if not counted:
+        return {}
+    collisions, safe = sum(row.collisions for row in counted), sum(row.safe_starts for row in counted)
+    return {"test/collision_rate": collisions / safe, "test/worst_type": max(row.rate or 0.0 for row in counted)}
