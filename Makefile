@@ -8,6 +8,9 @@ STAMP  := $(VENV)/.stamp
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 
+# pip leaves byte-compilation to the first import of a module (half a minute less), which must then be allowed to keep it.
+unexport PYTHONDONTWRITEBYTECODE
+
 # The stamp holds the path of the checkout and is written last. Without it, with a stamp of another checkout or without
 # an interpreter (interrupted, copied, or Python was upgraded), the environment is built from nothing.
 SOUND := $(shell test -x $(BIN)/python && test "$$(cat $(STAMP) 2>/dev/null)" = "$(CURDIR)" && echo yes)
@@ -18,7 +21,8 @@ endif
 $(STAMP): pyproject.toml constraints.txt
 	$(if $(SOUND),test -x $(BIN)/python || )$(PYTHON) -m venv --clear $(VENV)
 	@rm -f $@
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev]"
+	@echo "Installing into $(VENV); this takes about a minute."
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt -e ".[dev]"
 	@echo "$(CURDIR)" > $@
 
 .PHONY: help

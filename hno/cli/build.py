@@ -26,6 +26,25 @@ def plain(config: DictConfig) -> dict[str, Any]:
     return {str(key): value for key, value in content.items()}
 
 
+POSITIVE = (
+    "operator.width", "operator.depth", "data.trajectories", "data.validation", "data.workers", "trainer.max_steps",
+    "trainer.validate_every", "trainer.print_every", "trainer.threads", "optimizer.lr", "evaluation.starts",
+)  # fmt: skip
+"""Entries that must be positive where they are set."""
+
+
+def check_numbers(config: DictConfig) -> None:
+    """Raise ValueError for sizes and rates that are not positive, and shares of the run outside [0, 1]."""
+    for name in POSITIVE:
+        value = OmegaConf.select(config, name)
+        if value is not None and not (isinstance(value, (int, float)) and value > 0):
+            raise ValueError(f"{name} must be a positive number; got {value!r}.")
+    for name in ("data.pretrain", "data.widening"):
+        value = OmegaConf.select(config, name)
+        if not (isinstance(value, (int, float)) and 0 <= value <= 1):
+            raise ValueError(f"{name} is a share of the run and must lie in [0, 1]; got {value!r}.")
+
+
 def build_game(config: DictConfig) -> Game:
     """The chosen game with its changed constants."""
     return make(config.game.name, **plain(config.game.constants))
@@ -41,6 +60,7 @@ def build_operator(config: DictConfig, game: Game) -> ValueOperator:
         activation=config.activation.name,
         weights=plain(config.loss.weights),
         norm=config.loss.norm,
+        scaled=config.loss.scaled,
         optimizer=optimizer,
         **options,
     )
@@ -74,8 +94,6 @@ def cache_folder(choice: str | None) -> Path:
 def build_trainer(config: DictConfig, folder: Path) -> L.Trainer:
     """A trainer that runs for a number of steps and leaves `last.ckpt` in the folder."""
     trainer = config.trainer
-    if trainer.max_steps < 1:
-        raise ValueError(f"trainer.max_steps must be at least 1; got {trainer.max_steps}.")
     callbacks: Sequence[L.Callback] = [
         checkpoints(folder, trainer.validate_every), StopOnDivergence(), progress_bar() or StepLines(trainer.print_every)
     ]  # fmt: skip

@@ -7,6 +7,7 @@ import os
 import socket
 import sys
 import time
+import warnings
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlparse
@@ -26,8 +27,12 @@ LOGGERS = ("csv", "wandb")
 
 
 def send_lightning_to_hydra() -> None:
-    """Let Lightning's and Python's warnings reach the root handlers, which Hydra has set to console and file."""
+    """Let Lightning's messages and Python's warnings reach the root handlers, which Hydra has set to console and file."""
     logging.captureWarnings(True)
+    warnings.filterwarnings("ignore", message=".*exists and is not empty")  # results.json is there first, on purpose
+    warnings.filterwarnings("ignore", message=".*isinstance.treespec, LeafSpec.")  # Lightning's own, from torch 2.13 on
+    warnings.filterwarnings("ignore", message=".*does not have many workers")  # batches are made in memory
+    logging.getLogger("lightning.pytorch.utilities.rank_zero").addFilter(lambda line: "Tip:" not in line.getMessage())
     for name in ("lightning", "lightning.pytorch", "lightning.fabric"):
         logger = logging.getLogger(name)
         logger.handlers.clear()
@@ -52,13 +57,12 @@ def loggers(config: DictConfig, folder: Path) -> list[Logger]:
 
 
 def _wandb_logger(config: DictConfig, folder: Path) -> WandbLogger:
-    mode = wandb_mode(config.logger.mode)
     return WandbLogger(
         project=config.logger.project,
         group=folder.parent.name,
         name=folder.name,
         save_dir=folder,
-        offline=mode == "offline",
+        mode=wandb_mode(config.logger.mode),
         config=OmegaConf.to_container(config, resolve=True),
     )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,9 +13,9 @@ from rich.table import Table
 
 log = logging.getLogger(__name__)
 
-COLUMNS = (
-    "theta", "labels", "starts", "safe", "collisions", "rate", "95 % interval", "min distance", "excess cost", "apart"
-)  # fmt: skip
+COLUMNS = ("theta", "labels", "safe", "collisions", "rate", "95 % interval", "distance", "excess cost", "apart")
+WIDTH = 110
+"""Columns of text where there is no terminal to ask."""
 
 
 def show(results: Mapping[str, Any], folder: Path) -> None:
@@ -23,22 +24,17 @@ def show(results: Mapping[str, Any], folder: Path) -> None:
     table = Table(*COLUMNS, title=title, caption=_caption(results))
     for row in results["table"]:
         table.add_row(*_cells(row))
-    console = Console()
-    console.print(table if console.is_terminal else _wide(table))
+    console = Console(width=None if sys.stdout.isatty() else WIDTH)
+    console.print(table)
     console.print(verdict(results["table"]))
     spent = ", ".join(f"{part.replace('_', ' ')} {seconds:.0f} s" for part, seconds in results["seconds"].items())
     console.print(f"Time: {spent}\nResults: {folder / 'results.json'}", soft_wrap=True)
 
 
-def _wide(table: Table) -> Table:
-    table.min_width = 120
-    return table
-
-
 def _caption(results: Mapping[str, Any]) -> str:
     return (
-        f"safe: equilibrium keeps {100 * results['clearance']:g} cm; apart: unsolved / inevitable / marginal starts; "
-        "distance in m, costs as medians"
+        f"safe: starts whose equilibrium keeps {100 * results['clearance']:g} cm; distance: smallest, in m; excess cost: "
+        "above the equilibrium's joint cost; both medians; apart: unsolved / inevitable / marginal starts"
     )
 
 
@@ -47,8 +43,7 @@ def _cells(row: Mapping[str, Any]) -> list[str]:
     return [
         ", ".join(f"{t:g}" for t in row["theta"]),
         "seen" if row["seen"] else "unseen",
-        str(row["starts"]),
-        str(row["safe_starts"]),
+        f"{row['safe_starts']} of {row['starts']}",
         str(row["collisions"]),
         percent(row["rate"]),
         "n/a" if interval is None else f"{percent(interval[0])} to {percent(interval[1])}",
@@ -76,7 +71,8 @@ def verdict(table: Sequence[Mapping[str, Any]]) -> str:
     collisions = sum(row["collisions"] for row in table)
     worst = max((row for row in table if row["rate"] is not None), key=lambda row: row["rate"])
     at = ", ".join(f"{t:g}" for t in worst["theta"])
-    return f"{collisions} collisions in {safe} safe starts ({percent(collisions / safe)}); worst {percent(worst['rate'])} at ({at})."
+    total = f"{collisions} collisions in {safe} safe starts ({percent(collisions / safe)})"
+    return f"{total}; worst {percent(worst['rate'])} at ({at})."
 
 
 def report(error: Exception) -> None:

@@ -13,7 +13,7 @@ import wandb
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from hno.cli.build import build_data, build_game, build_operator, build_trainer
+from hno.cli.build import build_data, build_game, build_operator, build_trainer, check_numbers
 from hno.cli.config import run_command
 from hno.cli.evaluate import check_evaluation, evaluate_policy
 from hno.cli.logs import label_progress, send_lightning_to_hydra
@@ -61,6 +61,7 @@ def train(config: DictConfig) -> bool:
 
 
 def _run(config: DictConfig, folder: Path, results: Results) -> None:
+    check_numbers(config)
     L.seed_everything(config.seed, verbose=False)
     if config.trainer.threads is not None:
         torch.set_num_threads(config.trainer.threads)
@@ -78,7 +79,8 @@ def _run(config: DictConfig, folder: Path, results: Results) -> None:
     data.prepare_data()
     data.setup("fit")
     results.time("labels", data.label_seconds)
-    operator.set_scales(Scales(*data.label_scales()))
+    if config.loss.scaled:
+        operator.set_scales(Scales(*data.label_scales()))
 
     began = time.perf_counter()
     trainer.fit(operator, datamodule=data, ckpt_path=config.resume, weights_only=True)

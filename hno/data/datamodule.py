@@ -81,7 +81,7 @@ class GameData(L.LightningDataModule):
         trajectories: labelled trajectories per type.
         cache: folder of label files.
         seed: of start states, batches and collocation points.
-        batch_sizes: rows per step of each stream.
+        batch_sizes: rows per step of each stream; None for every labelled row, each step.
         curriculum: when collocation begins and how the window widens.
         shares: where interior points come from, see `hno.data.sampling.SOURCES`.
         interior_types: "labelled" draws the types of collocation points among `types`, "box" from the type box.
@@ -99,7 +99,7 @@ class GameData(L.LightningDataModule):
         trajectories: int,
         cache: Path,
         seed: int,
-        batch_sizes: Mapping[str, int],
+        batch_sizes: Mapping[str, int | None],
         curriculum: Curriculum,
         shares: Mapping[str, float],
         interior_types: str = "labelled",
@@ -112,10 +112,9 @@ class GameData(L.LightningDataModule):
         check_shares(shares)
         if interior_types not in ("labelled", "box"):
             raise ValueError(f"interior_types must be 'labelled' or 'box'; got {interior_types!r}.")
-        sizes = {"trajectories": trajectories, "validation": validation, **batch_sizes}
-        for name, size in sizes.items():
-            if size < 1:
-                raise ValueError(f"data.{name} must be at least 1; got {size}.")
+        for name, size in {"trajectories": trajectories, "validation": validation, **batch_sizes}.items():
+            if size is not None and size < 1:
+                raise ValueError(f"The number of rows or trajectories {name!r} must be at least 1; got {size}.")
         self.game, self.streams, self.seed = game, frozenset(streams), seed
         self.type_list = [tuple(map(float, theta)) for theta in types]
         self.types = torch.tensor(self.type_list)
@@ -151,15 +150,20 @@ class GameData(L.LightningDataModule):
         generator = torch.Generator().manual_seed(_mix(self.seed, step, rank))
         batch: Batch = {}
         if "bvp" in self.streams:
-            chosen = torch.randint(self.train_rows.size, (self.batch_sizes["bvp"],), generator=generator)
-            batch["bvp"] = self.train_rows.at(chosen)
+            batch["bvp"] = self.train_rows.at(self._row_numbers(generator))
         if self.curriculum.active(step):
             for name in sorted(self.streams & {"interior", "terminal"}):
                 batch[name] = Sample(self._points(name, self.curriculum.window(step), generator))
         return batch
 
+    def _row_numbers(self, generator: torch.Generator) -> Tensor:
+        size = self.batch_sizes["bvp"]
+        if size is None:
+            return torch.arange(self.train_rows.size)
+        return torch.randint(self.train_rows.size, (size,), generator=generator)
+
     def _points(self, stream: str, window: float, generator: torch.Generator) -> Points:
-        size = self.batch_sizes[stream]
+        size = self.batch_sizes[stream] or self.train_rows.size
         if self.interior_types == "box":
             theta = self.game.type_box.sample(size, generator)
         else:

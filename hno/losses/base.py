@@ -38,7 +38,7 @@ class LossTerm(nn.Module, abc.ABC):
         """Zero where the term is satisfied, shape (B, P, ...)."""
 
     @abc.abstractmethod
-    def scale(self, game: Game, scales: Scales) -> Tensor:
+    def scale(self, game: Game, sample: Sample, scales: Scales) -> Tensor:
         """Size that makes the residual dimensionless, broadcastable to it."""
 
 

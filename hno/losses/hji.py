@@ -31,9 +31,14 @@ class HJIResidual(LossTerm):
         """(B, P), 1/s."""
         return hji_residual(game, sample.points, field)
 
-    def scale(self, game: Game, scales: Scales) -> Tensor:
-        """Size of values, per horizon."""
-        return scales.value / game.horizon
+    def scale(self, game: Game, sample: Sample, scales: Scales) -> Tensor:
+        """Size of values per horizon, plus the penalty at each point, (B, P).
+
+        Without the penalty, points deep inside the violation set, where it is thousands of times larger and where no
+        equilibrium goes, would make up the whole loss.
+        """
+        points = sample.points
+        return scales.value / game.horizon + game.penalty(game.constraint(points.x, points.theta))
 
 
 @final
@@ -47,6 +52,6 @@ class Boundary(LossTerm):
         """(B, P)."""
         return field.value - game.terminal_value(sample.points.x)
 
-    def scale(self, game: Game, scales: Scales) -> Tensor:
+    def scale(self, game: Game, sample: Sample, scales: Scales) -> Tensor:
         """Size of values."""
         return scales.value

@@ -28,7 +28,7 @@ class ValueDeviation(LossTerm):
         """(B, P)."""
         return field.value - _labels(sample).value
 
-    def scale(self, game: Game, scales: Scales) -> Tensor:
+    def scale(self, game: Game, sample: Sample, scales: Scales) -> Tensor:
         """Size of values."""
         return scales.value
 
@@ -44,6 +44,6 @@ class CostateDeviation(LossTerm):
         """(B, P, P, n)."""
         return field.costate - _labels(sample).costate
 
-    def scale(self, game: Game, scales: Scales) -> Tensor:
+    def scale(self, game: Game, sample: Sample, scales: Scales) -> Tensor:
         """Size of each costate component."""
         return scales.costate

@@ -39,6 +39,7 @@ class ValueOperator(L.LightningModule, abc.ABC):
         weights: weight of each term by name; terms that are not named weigh 0, names without a term are ignored, so
             that one list serves every operator.
         norm: pointwise norm of the residuals, see `Norm`.
+        scaled: measure residuals in the sizes of the labels (see `LossTerm.scale`) rather than in physical units.
         width: hidden and output width of trunk and branch.
         depth: hidden layers of trunk and branch.
         optimizer: needed for training only.
@@ -54,6 +55,7 @@ class ValueOperator(L.LightningModule, abc.ABC):
         activation: str = "tanh",
         weights: Mapping[str, float] | None = None,
         norm: str = "l1",
+        scaled: bool = True,
         width: int = 64,
         depth: int = 4,
         optimizer: Optimizer | None = None,
@@ -63,7 +65,7 @@ class ValueOperator(L.LightningModule, abc.ABC):
         self.seen_types: list[tuple[float, ...]] = []
         self.game = game
         self.optimizer = optimizer
-        self.norm = Norm(norm)
+        self.norm, self.scaled = Norm(norm), scaled
         self.losses = nn.ModuleDict({name: term() for name, term in self.terms.items()})
         self.weights = {name: float(w) for name, w in (weights or dict.fromkeys(self.terms, 1.0)).items() if name in self.terms}
         players, states = game.players, game.state_dim
@@ -132,8 +134,9 @@ class ValueOperator(L.LightningModule, abc.ABC):
         losses: dict[str, Tensor] = {}
         for name, term in self.losses.items():
             if term.stream in samples and self.weights.get(name, 0) > 0:
-                residual = term.residual(self.game, samples[term.stream], fields[term.stream])
-                losses[name] = self.norm(residual / term.scale(self.game, scales))
+                sample = samples[term.stream]
+                residual = term.residual(self.game, sample, fields[term.stream])
+                losses[name] = self.norm(residual / term.scale(self.game, sample, scales) if self.scaled else residual)
         total = torch.stack([self.weights[name] * loss for name, loss in losses.items()]).sum()
         self.log_dict({f"loss/{name}": loss.detach() for name, loss in losses.items()})
         self.log("loss/total", total.detach(), prog_bar=True)

@@ -55,18 +55,11 @@ def terminal_costate(game: Game, x: Tensor, *, create_graph: bool = False) -> Te
         return torch.autograd.grad(total, copies, create_graph=create_graph)[0]
 
 
-def pmp_rate(game: Game, x: Tensor, own: Tensor, theta: Tensor, *, create_graph: bool = False) -> tuple[Tensor, Tensor]:
-    """Time derivatives of states and own costates with the optimal controls inserted.
-
-    Args:
-        game: the game; its dynamics are decoupled.
-        x: states, (B, P, n).
-        own: own costates dV_i / dx_i, (B, P, n).
-        theta: player types, (B, P).
-        create_graph: keep the result differentiable in `x` and `own`.
+def drift_rate(game: Game, x: Tensor, own: Tensor, *, create_graph: bool = False) -> tuple[Tensor, Tensor]:
+    """The part of `pmp_rate` without the penalty; that of player i depends on (x_i, own_i) alone.
 
     Returns:
-        dx/dt and d(own)/dt = -dH_i/dx_i at fixed control, each (B, P, n).
+        dx/dt and -(df_i/dx_i)' own_i at fixed control, each (B, P, n).
     """
     with torch.enable_grad():
         x = x if x.requires_grad else x.detach().requires_grad_()
@@ -74,5 +67,46 @@ def pmp_rate(game: Game, x: Tensor, own: Tensor, theta: Tensor, *, create_graph:
         held = x.view_as(x)  # differentiating in this alias leaves the control's dependence on x out
         flow = game.dynamics(held, u)
         transport = torch.autograd.grad(flow, held, own, create_graph=create_graph, retain_graph=True)[0]
-        penalty = own_costate(penalty_gradient(game, x, theta, create_graph=create_graph))
-    return flow, penalty - transport
+    return flow, -transport
+
+
+def pmp_rate(game: Game, x: Tensor, own: Tensor, theta: Tensor) -> tuple[Tensor, Tensor]:
+    """Time derivatives of states and own costates with the optimal controls inserted.
+
+    Args:
+        game: the game; its dynamics are decoupled.
+        x: states, (B, P, n).
+        own: own costates dV_i / dx_i, (B, P, n).
+        theta: player types, (B, P).
+
+    Returns:
+        dx/dt and d(own)/dt = -dH_i/dx_i at fixed control, each (B, P, n).
+    """
+    flow, transport = drift_rate(game, x, own)
+    return flow.detach(), own_costate(penalty_gradient(game, x, theta)) + transport
+
+
+def pmp_rate_and_jacobian(game: Game, x: Tensor, own: Tensor, theta: Tensor) -> tuple[Tensor, Tensor]:
+    """The rate of z = (x, own), flattened, and its derivative in z; arguments as for `pmp_rate`.
+
+    Only the penalty couples the players: the rest of the Jacobian is one block per player.
+
+    Returns:
+        (B, D) and (B, D, D) with D = 2 P n.
+    """
+    players, states = x.shape[-2:]
+    with torch.enable_grad():
+        both = torch.cat([x, own], -1).detach().requires_grad_()
+        drift = torch.cat(drift_rate(game, *both.split(states, -1), create_graph=True), -1)
+        blocks = jacobian_rows(drift, both).movedim(0, -2).unflatten(-1, (2, states)).unflatten(-3, (2, states))
+        flat = x.flatten(-2).detach().requires_grad_()
+        load = penalty_gradient(game, flat.unflatten(-1, (players, states)), theta, create_graph=True)
+        load = own_costate(load).flatten(-2)
+        curvature = jacobian_rows(load, flat).movedim(0, -2)
+    rate = torch.cat([part.flatten(-2) for part in drift.detach().split(states, -1)], -1)
+    alone = torch.eye(players, dtype=x.dtype, device=x.device)
+    jacobian = torch.einsum("...iakbl,ij->...aikbjl", blocks, alone).flatten(-6, -4).flatten(-3)
+    half = players * states
+    rate[..., half:] += load.detach()
+    jacobian[..., half:, :half] += curvature
+    return rate, jacobian

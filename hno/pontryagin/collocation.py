@@ -13,8 +13,12 @@ from torch import Tensor
 
 from hno.games import Game
 from hno.games.base import own_costate
-from hno.pontryagin.adjoint import jacobian_rows, pmp_rate, terminal_costate
+from hno.pontryagin.adjoint import jacobian_rows, pmp_rate, pmp_rate_and_jacobian, terminal_costate
 from hno.types import Status
+
+
+BLOCK = 512
+"""Points that are differentiated together: few enough for the processor's cache."""
 
 
 class Newton(NamedTuple):
@@ -54,20 +58,25 @@ class Collocation:
         self.game = game
         self.half = game.players * game.state_dim
 
-    def rate(self, z: Tensor, theta: Tensor, *, create_graph: bool = False) -> Tensor:
+    def rate(self, z: Tensor, theta: Tensor) -> Tensor:
         """dz/dt, (B, K, D)."""
-        shape = (self.game.players, self.game.state_dim)
-        x, own = (part.unflatten(-1, shape) for part in z.split(self.half, -1))
-        types = theta.unsqueeze(-2).expand(*z.shape[:-1], -1)
-        rates = pmp_rate(self.game, x, own, types, create_graph=create_graph)
+        x, own = self.split(z)
+        rates = pmp_rate(self.game, x, own, theta.unsqueeze(-2).expand(x.shape[:-1]))
         return torch.cat([r.flatten(-2) for r in rates], -1)
 
     def rate_and_jacobian(self, z: Tensor, theta: Tensor) -> tuple[Tensor, Tensor]:
         """dz/dt and its derivative in z, (B, K, D) and (B, K, D, D)."""
-        with torch.enable_grad():
-            z = z.detach().requires_grad_()
-            rate = self.rate(z, theta, create_graph=True)
-            return rate.detach(), jacobian_rows(rate, z).movedim(0, -2)
+        x, own = self.split(z)
+        types = theta.unsqueeze(-2).expand(x.shape[:-1])
+        blocks = zip(*(part.flatten(0, 1).split(BLOCK) for part in (x, own, types)), strict=True)
+        parts = zip(*(pmp_rate_and_jacobian(self.game, *block) for block in blocks), strict=True)
+        rate, jacobian = (torch.cat(part).unflatten(0, z.shape[:2]) for part in parts)
+        return rate, jacobian
+
+    def split(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """States and own costates of the unknowns, each (..., P, n)."""
+        x, own = z.unflatten(-1, (2, self.game.players, self.game.state_dim)).unbind(-3)
+        return x, own
 
     def midpoint(self, z: Tensor, rate: Tensor, step: Tensor) -> Tensor:
         """Hermite interpolant at interval centres, (B, K - 1, D)."""
@@ -77,8 +86,8 @@ class Collocation:
     def defect(self, at: Iterate) -> Tensor:
         """Simpson defect of each interval, (B, K - 1, D)."""
         step = at.t.diff(dim=-1)
-        rate = self.rate(at.z, at.theta).detach()
-        middle = self.rate(self.midpoint(at.z, rate, step), at.theta).detach()
+        rate = self.rate(at.z, at.theta)
+        middle = self.rate(self.midpoint(at.z, rate, step), at.theta)
         return at.z.diff(dim=-2) - step.unsqueeze(-1) / 6 * (rate[:, :-1] + 4 * middle + rate[:, 1:])
 
     def terminal_defect(self, at: Iterate) -> Tensor:

@@ -16,6 +16,10 @@ from hno.pontryagin.adjoint import jacobian_rows
 from hno.pontryagin.integrate import runge_kutta
 
 
+BLOCK = 64
+"""Rows that are expanded together: few enough for the processor's cache."""
+
+
 class Expansion(NamedTuple):
     """Second-order model of the joint problem around a trajectory, in deviations of states (D) and controls (M)."""
 
@@ -83,6 +87,10 @@ class JointProblem:
 
     def cost(self, x: Tensor, v: Tensor) -> Tensor:
         """Joint cost with the stand-in penalty, (R,)."""
+        rows = torch.arange(len(x), device=x.device).split(BLOCK)
+        return torch.cat([self.rows(index)._cost_block(x[index], v[index]) for index in rows])
+
+    def _cost_block(self, x: Tensor, v: Tensor) -> Tensor:
         slope, height = self.game.penalty_slope, self.game.penalty_height
         penalty = height * torch.nn.functional.softplus(slope * self.worst_constraint(x))
         effort = self.game.effort(self.control(v)).sum((-2, -1))
@@ -90,20 +98,25 @@ class JointProblem:
 
     def expand(self, x: Tensor, v: Tensor) -> Expansion:
         """Gauss-Newton expansion around a trajectory, (R, N + 1, P, n), (R, N, P, m)."""
+        rows = torch.arange(len(x), device=x.device).split(BLOCK)
+        parts = [self.rows(index)._expand_block(x[index], v[index]) for index in rows]
+        return Expansion(*(torch.cat(part) for part in zip(*parts, strict=True)))
+
+    def _expand_block(self, x: Tensor, v: Tensor) -> Expansion:
         sensitivity = self._sensitivity(x[:, :-1], v)
         gradient, hessian = self._penalty_expansion(x, sensitivity)
         effort_gradient, effort_hessian = self._effort_expansion(v)
         states = x.shape[-2] * x.shape[-1]
         gradient[..., states:] += effort_gradient
         hessian[..., states:, states:] += effort_hessian
-        dynamics = torch.cat([_block_diagonal(part) for part in sensitivity.split(list((x.shape[-1], v.shape[-1])), -1)], -1)
+        dynamics = torch.cat([_block_diagonal(part) for part in sensitivity.split([x.shape[-1], v.shape[-1]], -1)], -1)
         return Expansion(dynamics, gradient, hessian, *self._end_expansion(x[:, -1]))
 
     def _sensitivity(self, x: Tensor, v: Tensor) -> Tensor:
         """d(next state of i) / d(state and control of i), (R, N, P, n, n + m)."""
         with torch.enable_grad():
             both = torch.cat([x, v], -1).detach().requires_grad_()
-            after = self.advance(*both.split(list((x.shape[-1], v.shape[-1])), -1))
+            after = self.advance(*both.split([x.shape[-1], v.shape[-1]], -1))
             return jacobian_rows(after, both).movedim(0, -2)
 
     def _penalty_expansion(self, x: Tensor, sensitivity: Tensor) -> tuple[Tensor, Tensor]:

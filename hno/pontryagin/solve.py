@@ -127,10 +127,8 @@ def _encounter_weight(game: Game, labels: Tensor, x: Tensor, u: Tensor, theta: T
 def _describe(game: Game, at: Iterate, mesh: Mesh, residual: Tensor, status: Tensor) -> Extremal:
     """Extremals on the label grid of solved iterates."""
     equations = Collocation(game)
-    shape = (game.players, game.state_dim)
-    centre = equations.midpoint(at.z, equations.rate(at.z, at.theta).detach(), mesh.step)
-    x, own = (part.unflatten(-1, shape) for part in at.z.split(equations.half, -1))
-    middle_x, middle_own = (part.unflatten(-1, shape) for part in centre.split(equations.half, -1))
+    centre = equations.midpoint(at.z, equations.rate(at.z, at.theta), mesh.step)
+    (x, own), (middle_x, middle_own) = equations.split(at.z), equations.split(centre)
     u, middle_u = game.best_response(x, own), game.best_response(middle_x, middle_own)
     costate = costates(game, mesh.t, x, u, (middle_x, middle_u), at.theta)
     value = values(game, mesh.t, x, u, (middle_x, middle_u), at.theta)

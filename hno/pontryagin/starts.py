@@ -20,12 +20,10 @@ class Search(NamedTuple):
     """Sizes of the evasive manoeuvres that are tried, in half widths of the control box."""
     margin: float = 0.6
     """Constraint tightening while the manoeuvres are sorted out, m for distance constraints."""
-    coarse_iterations: int = 12
-    """Descent iterations with the margin, for every manoeuvre."""
+    rounds: tuple[tuple[int, int], ...] = ((4, 5), (8, 3))
+    """Descent iterations with the margin, and the number of manoeuvres per state that are kept after them."""
     fine_iterations: int = 25
-    """Descent iterations without it, for the manoeuvres that are kept."""
-    kept: int = 3
-    """Starting trajectories per state that go on."""
+    """Descent iterations without the margin, for the manoeuvres that are kept at last."""
     tolerance: float = 1e-4
     """Relative decrease at which a descent ends."""
 
@@ -51,21 +49,19 @@ def find_starts(game: Game, start: Tensor, theta: Tensor, search: Search) -> Sta
         search: settings.
     """
     shapes = manoeuvres(game, dtype=start.dtype, device=start.device)
-    count, size = len(shapes), len(start)
-    x_rows, theta_rows = start.repeat_interleave(count, 0), theta.repeat_interleave(count, 0)
-    guarded = JointProblem(game, theta_rows, search.margin)
-    v = _best_amplitude(guarded, x_rows, shapes.repeat(size, 1, 1, 1), search.amplitudes)
-    x, v, cost = descend(guarded, x_rows, v, search.coarse_iterations, search.tolerance)
-    kept = min(search.kept, count)
-    order = _distinct_cost(x.unflatten(0, (size, count)), cost.view(size, count)).argsort(-1)[:, :kept]
-    rows = (order + count * torch.arange(size, device=start.device).unsqueeze(-1)).flatten()
-    exact = JointProblem(game, theta_rows[rows])
-    x, v, cost = descend(exact, x_rows[rows], v[rows], search.fine_iterations, search.tolerance)
-    u = exact.control(v)
-    x, u, cost = (part.unflatten(0, (size, kept)) for part in (x, u, cost))
-    cost, order = _distinct_cost(x, cost).sort(-1)
-    batch = torch.arange(size, device=start.device).unsqueeze(-1)
-    return Starts(x[batch, order], u[batch, order], cost)
+    size, count = len(start), len(shapes)
+    rows = torch.arange(size, device=start.device).repeat_interleave(count)
+    guarded = JointProblem(game, theta[rows], search.margin)
+    v = _best_amplitude(guarded, start[rows], shapes.repeat(size, 1, 1, 1), search.amplitudes)
+    for iterations, kept in search.rounds:
+        guarded = JointProblem(game, theta[rows], search.margin)
+        x, v, cost = descend(guarded, start[rows], v, iterations, search.tolerance)
+        best = _cheapest(x, cost, size)[1][:, :kept].flatten()
+        rows, v = rows[best], v[best]
+    exact = JointProblem(game, theta[rows])
+    x, v, cost = descend(exact, start[rows], v, search.fine_iterations, search.tolerance)
+    cost, order = _cheapest(x, cost, size)
+    return Starts(x[order], exact.control(v)[order], cost)
 
 
 def manoeuvres(game: Game, *, dtype: torch.dtype, device: torch.device) -> Tensor:
@@ -92,11 +88,23 @@ def _best_amplitude(problem: JointProblem, start: Tensor, shape: Tensor, amplitu
     return torch.stack(tried)[costs.argmin(0), rows]
 
 
-def _distinct_cost(x: Tensor, cost: Tensor, tolerance: float = 1e-2) -> Tensor:
-    """Costs with inf for every trajectory that repeats a cheaper one, (B, S)."""
+def _cheapest(x: Tensor, cost: Tensor, size: int, tolerance: float = 1e-2) -> tuple[Tensor, Tensor]:
+    """Sort the starts of each state by cost, with repetitions of a cheaper one last.
+
+    Args:
+        x: states, rows of one initial state after the other, (size * S, N + 1, P, n).
+        cost: joint cost, (size * S,).
+        size: number of initial states.
+        tolerance: largest deviation of a repetition, in widths of the state's own range.
+
+    Returns:
+        Costs, inf for repetitions, and the rows they belong to, both (size, S).
+    """
+    x, cost = x.unflatten(0, (size, -1)), cost.unflatten(0, (size, -1))
     spread = x.amax((1, 2), keepdim=True) - x.amin((1, 2), keepdim=True)
     shape = (x / spread.clamp_min(1e-6)).flatten(2)
-    apart = (shape.unsqueeze(1) - shape.unsqueeze(2)).abs().amax(-1)
-    order = cost.argsort(dim=-1, stable=True).argsort(dim=-1)
-    cheaper = order.unsqueeze(-1) > order.unsqueeze(-2)
-    return cost.masked_fill(((apart < tolerance) & cheaper).any(-1), torch.inf)
+    apart = torch.cdist(shape, shape, p=torch.inf)
+    rank = cost.argsort(dim=-1, stable=True).argsort(dim=-1)
+    repeats = ((apart < tolerance) & (rank.unsqueeze(-1) > rank.unsqueeze(-2))).any(-1)
+    cost, order = cost.masked_fill(repeats, torch.inf).sort(dim=-1, stable=True)
+    return cost, order + len(cost[0]) * torch.arange(size, device=cost.device).unsqueeze(-1)
