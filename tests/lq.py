@@ -146,14 +146,10 @@ def open_loop_nash(game: LinearQuadratic, x0: Tensor, t: Tensor) -> Solution:
 
 def flow_matrix(game: LinearQuadratic) -> Tensor:
     """M of z' = M z."""
-    players, drift = game.players, game.joint_drift
-    size = len(drift)
-    top = [game.gain[j] / 2 for j in range(players)]
-    own_rows = torch.cat([drift, *top], 1)
-    adjoints = torch.block_diag(*[-drift.mT] * players)
-    lower = torch.cat([2 * game.q.flatten(0, 1), adjoints], 1)
-    assert own_rows.shape == (size, size * (1 + players))
-    return torch.cat([own_rows, lower])
+    drift = game.joint_drift
+    states = torch.cat([drift, *(game.gain / 2)], 1)
+    adjoints = torch.cat([2 * game.q.flatten(0, 1), torch.block_diag(*[-drift.mT] * game.players)], 1)
+    return torch.cat([states, adjoints])
 
 
 def spent_cost(game: LinearQuadratic, flow: Tensor, player: int, time_left: Tensor, z: Tensor) -> Tensor:

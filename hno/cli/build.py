@@ -95,8 +95,10 @@ def build_trainer(config: DictConfig, folder: Path) -> L.Trainer:
     """A trainer that runs for a number of steps and leaves `last.ckpt` in the folder."""
     trainer = config.trainer
     callbacks: Sequence[L.Callback] = [
-        checkpoints(folder, trainer.validate_every), StopOnDivergence(), progress_bar() or StepLines(trainer.print_every)
-    ]  # fmt: skip
+        checkpoints(folder, trainer.validate_every),
+        StopOnDivergence(),
+        progress_bar() or StepLines(trainer.print_every),
+    ]
     return L.Trainer(
         accelerator=trainer.accelerator,
         devices=trainer.devices,

@@ -6,6 +6,7 @@ import re
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import hydra
 from hydra.core.config_store import ConfigStore
@@ -16,7 +17,7 @@ from hno.games import games
 from hno.operators import activations, operators
 from hno.registry import Registry, unknown_name
 
-PLUGGABLE: dict[str, Registry] = {"game": games, "operator": operators, "activation": activations}
+PLUGGABLE: dict[str, Registry[Any]] = {"game": games, "operator": operators, "activation": activations}
 """Groups whose choices are registered classes."""
 
 

@@ -19,7 +19,10 @@ from hno.cli.results import Results, config_hash
 from hno.cli.summary import report, show
 from hno.data.generate import Request, labels_for
 from hno.evaluation.closed_loop import TypeRow, collision_table
+from hno.evaluation.rollout import rollout
 from hno.operators.checkpoint import OperatorPolicy, load_policy
+from hno.report.picture import PlotsMissingError, rollout_picture, typical
+from hno.types import Extremal
 
 log = logging.getLogger(__name__)
 
@@ -105,7 +108,19 @@ def evaluate_policy(
     table = collision_table(policy.game, policy, labels, policy.operator.seen_types, clearance, dt)
     results.time("evaluation", time.perf_counter() - began)
     results.update(clearance=clearance, dt=dt, test_seed=seed, table=[row._asdict() for row in table])
+    draw(policy, labels[0], results.path.parent / "rollout.png")
     return table
+
+
+def draw(policy: OperatorPolicy, found: Extremal, path: Path, episodes: int = 15) -> None:
+    """Draw a typical episode from the first starts of a label set; without matplotlib, say so."""
+    starts, theta = found.x[:episodes, 0].float(), found.theta[:episodes].float()
+    played = rollout(policy.game, policy, starts, theta)
+    names = policy.operator.names()
+    try:
+        rollout_picture(policy.game, played, theta, path, " / ".join(names.values()), typical(played))
+    except PlotsMissingError as error:
+        log.info("No picture: %s", error)
 
 
 def check_evaluation(starts: int, clearance: float, dt: float) -> None:

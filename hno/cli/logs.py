@@ -27,7 +27,7 @@ LOGGERS = ("csv", "wandb")
 
 
 def send_lightning_to_hydra() -> None:
-    """Let Lightning's messages and Python's warnings reach the root handlers, which Hydra has set to console and file."""
+    """Let Lightning's messages and Python's warnings reach Hydra's handlers, console and file."""
     logging.captureWarnings(True)
     warnings.filterwarnings("ignore", message=".*exists and is not empty")  # results.json is there first, on purpose
     warnings.filterwarnings("ignore", message=".*isinstance.treespec, LeafSpec.")  # Lightning's own, from torch 2.13 on

@@ -33,8 +33,8 @@ def show(results: Mapping[str, Any], folder: Path) -> None:
 
 def _caption(results: Mapping[str, Any]) -> str:
     return (
-        f"safe: starts whose equilibrium keeps {100 * results['clearance']:g} cm; distance: smallest, in m; excess cost: "
-        "above the equilibrium's joint cost; both medians; apart: unsolved / inevitable / marginal starts"
+        f"safe: starts whose equilibrium keeps {100 * results['clearance']:g} cm; distance: smallest, in m; "
+        "excess cost: above the equilibrium's joint cost; both medians; apart: unsolved / inevitable / marginal starts"
     )
 
 
@@ -46,7 +46,7 @@ def _cells(row: Mapping[str, Any]) -> list[str]:
         f"{row['safe_starts']} of {row['starts']}",
         str(row["collisions"]),
         percent(row["rate"]),
-        "n/a" if interval is None else f"{percent(interval[0])} to {percent(interval[1])}",
+        "n/a" if interval is None else f"{100 * interval[0]:.2f} to {100 * interval[1]:.2f} %",
         number(row["median_min_distance"]),
         f"{number(row['median_excess_cost'])} of {number(row['median_label_cost'])}",
         f"{row['unsolved']} / {row['inevitable']} / {row['marginal']}",

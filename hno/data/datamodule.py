@@ -9,7 +9,7 @@ from typing import NamedTuple
 import lightning as L
 import torch
 from torch import Tensor
-from torch.utils.data import DataLoader, IterableDataset
+from torch.utils.data import DataLoader, Dataset, IterableDataset
 
 from hno.data.curriculum import Curriculum
 from hno.data.generate import Progress, Request, labels_for
@@ -179,8 +179,18 @@ class GameData(L.LightningDataModule):
 
     def val_dataloader(self) -> DataLoader[Sample]:
         """Held-out labelled rows, in one batch."""
-        whole = self.val_rows.at(torch.arange(self.val_rows.size))
-        return DataLoader([whole], batch_size=None)  # type: ignore[arg-type] - a list is a map-style dataset
+        return DataLoader(_Whole(self.val_rows), batch_size=None)
+
+
+class _Whole(Dataset[Sample]):
+    def __init__(self, rows: Rows) -> None:
+        self.rows = rows
+
+    def __len__(self) -> int:
+        return 1
+
+    def __getitem__(self, index: int) -> Sample:
+        return self.rows.at(torch.arange(self.rows.size))
 
 
 class _Steps(IterableDataset[Batch]):

@@ -23,11 +23,11 @@ SOLVER_VERSION = 1
 
 
 class Request(NamedTuple):
-    """A set of labels: `count` start states of one type, drawn by `seed`."""
+    """A set of labels: `starts` start states of one type, drawn by `seed`."""
 
     theta: tuple[float, ...]
     """Player types."""
-    count: int
+    starts: int
     """Number of start states."""
     seed: int
     """Seed of the start states."""
@@ -48,10 +48,10 @@ def default_cache() -> Path:
 
 
 def start_states(game: Game, request: Request) -> Tensor:
-    """Uniform start states of a request, float64, (count, P, n)."""
+    """Uniform start states of a request, float64, (starts, P, n)."""
     text = canonical_json({"seed": request.seed, "split": request.split, "theta": request.theta})
     generator = torch.Generator().manual_seed(int(hashlib.sha256(text.encode()).hexdigest()[:15], 16))
-    return game.initial_box.widened(request.widen).cpu().sample(request.count, generator).double()
+    return game.initial_box.widened(request.widen).cpu().sample(request.starts, generator).double()
 
 
 def labels_for(
@@ -102,7 +102,7 @@ def label_path(game: Game, request: Request, cache: Path, settings: Solver) -> P
     """File of a request; its name holds a hash of everything that determines the labels."""
     key = hashlib.sha256(canonical_json(provenance(game, request, settings)).encode()).hexdigest()[:16]
     types = "-".join(f"{t:g}" for t in request.theta)
-    return cache / type(game).__name__ / f"{types}_{request.split}{request.seed}_n{request.count}_{key}.safetensors"
+    return cache / type(game).__name__ / f"{types}_{request.split}{request.seed}_n{request.starts}_{key}.safetensors"
 
 
 def provenance(game: Game, request: Request, settings: Solver) -> dict[str, Any]:

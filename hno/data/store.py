@@ -47,7 +47,7 @@ def write_labels(path: Path, labels: Extremal, provenance: Mapping[str, Any]) ->
     os.close(handle)
     try:
         safetensors.torch.save_file(tensors, temporary, metadata={KEY: canonical_json(header)})
-        os.replace(temporary, path)
+        Path(temporary).replace(path)
     except BaseException:
         Path(temporary).unlink(missing_ok=True)
         raise

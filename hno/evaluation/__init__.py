@@ -1,0 +1,1 @@
+"""Closed loop: how safe and how costly a policy is."""

@@ -69,9 +69,12 @@ def collision_table(
     types = torch.cat([found.theta for found in labels]).float()
     played = rollout(game, policy, starts, types, dt)
     sizes = [len(found.status) for found in labels]
-    parts = zip(*(getattr(played, name).split(sizes) for name in ("clearance", "distance", "value")), strict=True)
     known = {tuple(float(t) for t in theta) for theta in seen}
-    return [_row(found, *part, known, clearance) for found, part in zip(labels, parts, strict=True)]
+    parts = (played.clearance.split(sizes), played.distance.split(sizes), played.value.split(sizes))
+    return [
+        _row(found, gap, distance, value, known, clearance)
+        for found, gap, distance, value in zip(labels, *parts, strict=True)
+    ]
 
 
 def _row(

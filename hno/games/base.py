@@ -121,7 +121,7 @@ class Game(nn.Module, abc.ABC):
 
     @abc.abstractmethod
     def best_response(self, x: Tensor, own_costate: Tensor) -> Tensor:
-        """argmax of each player's Hamiltonian over its control box, (B, P, n), (B, P, n) -> (B, P, m)."""
+        """Argmax of each player's Hamiltonian over its control box, (B, P, n), (B, P, n) -> (B, P, m)."""
 
     def positions(self, x: Tensor) -> Tensor:
         """Where the players are in one common frame, m, for pictures, (B, P, n) -> (B, P, 2 or 3)."""

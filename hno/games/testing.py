@@ -12,8 +12,7 @@ from torch import Tensor
 
 from hno.games.base import Game, own_costate
 
-COSTATE_SCALES = (1.0, 30.0, 1000.0)
-"""Sizes of random costates: with optimal controls inside the control box, at its border and far outside."""
+COSTATE_SCALES = (1.0, 30.0, 1000.0)  # with optimal controls inside the control box, at its border and far outside
 
 
 class ContractError(AssertionError):
@@ -42,7 +41,7 @@ def check_game(game: Game) -> None:
     for dtype in (torch.float32, torch.float64):
         for check_dtype in (_check_outputs, _check_derivatives, _check_control_box):
             check_dtype(game.to(dtype), dtype)
-    for check in (_check_optimality, _check_decoupled, _check_roles, _check_penalty, _check_fingerprint):
+    for check in (_check_fingerprint, _check_decoupled, _check_optimality, _check_roles, _check_penalty):
         check(game)
 
 
@@ -138,9 +137,9 @@ def _check_derivatives(game: Game, dtype: torch.dtype) -> None:
     centre, still = (((box.lo + box.hi) / 2) for box in (game.state_box, game.control_box))
     places = {
         "in state_box": at,
-        "at the centres of the boxes": at._replace(x=centre.expand_as(at.x), u=still.expand_as(at.u)),
         "where the players' positions coincide": at._replace(x=_contact(game, at.x)),
         "where the players' states are equal": at._replace(x=at.x[:, :1].expand_as(at.x)),
+        "at the centres of the boxes": at._replace(x=centre.expand_as(at.x), u=still.expand_as(at.u)),
     }
     for where, point in places.items():
         inputs = _Point(*(part.detach().clone().requires_grad_() for part in point))
@@ -209,12 +208,13 @@ def _check_optimality(game: Game) -> None:
 def _check_decoupled(game: Game) -> None:
     at, moved = (_points(game, (16,), torch.float64, seed=seed) for seed in (0, 1))
     for player in range(game.players):
-        mask = torch.arange(game.players).unsqueeze(-1) == player
-        one_moved = at._replace(x=torch.where(mask, moved.x, at.x), u=torch.where(mask, moved.u, at.u))
-        for name in ("dynamics", "effort"):
+        mask = torch.arange(game.players) == player
+        parts = zip(at, moved, strict=True)
+        one_moved = _Point(*(torch.where(mask.view(-1, *(1,) * (a.dim() - 2)), b, a) for a, b in parts))
+        for name in ("dynamics", "effort", "best_response"):
             change = (_methods(game, one_moved)[name][0]() - _methods(game, at)[name][0]()).abs()
-            others = change.movedim(1, 0)[~mask.squeeze(-1)]
-            expected = f"{name} of each player that depends on its own state and control alone"
+            others = change.movedim(1, 0)[~mask]
+            expected = f"{name} of each player that depends on its own state, control and costate alone"
             got = f"a change of {float(others.amax() if len(others) else 0):.3g} when player {player} moves"
             _require(bool((others <= 1e-9).all()), expected, got, "Couple the players through `constraint`.")
 

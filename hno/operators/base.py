@@ -67,7 +67,9 @@ class ValueOperator(L.LightningModule, abc.ABC):
         self.optimizer = optimizer
         self.norm, self.scaled = Norm(norm), scaled
         self.losses = nn.ModuleDict({name: term() for name, term in self.terms.items()})
-        self.weights = {name: float(w) for name, w in (weights or dict.fromkeys(self.terms, 1.0)).items() if name in self.terms}
+        self.weights = {
+            name: float(w) for name, w in (weights or dict.fromkeys(self.terms, 1.0)).items() if name in self.terms
+        }
         players, states = game.players, game.state_dim
         self.has_roles = len(set(game.roles)) > 1
         sensors = game.sensors((game.type_box.lo + game.type_box.hi) / 2).shape[-1]
@@ -86,6 +88,12 @@ class ValueOperator(L.LightningModule, abc.ABC):
         """Registered names of game, operator and activation."""
         parts = games.name_of(type(self.game)), operators.name_of(type(self)), self.options["activation"]
         return dict(zip(("game", "operator", "activation"), map(str, parts), strict=True))
+
+    def term(self, name: str) -> LossTerm:
+        """The loss term of that name."""
+        term = self.losses[name]
+        assert isinstance(term, LossTerm)
+        return term
 
     def set_scales(self, scales: Scales) -> None:
         """Fix the sizes in which outputs and residuals are measured; they are saved with the weights."""
@@ -129,10 +137,13 @@ class ValueOperator(L.LightningModule, abc.ABC):
         sizes = [len(sample.points.tau) for sample in samples.values()]
         points = Points(*(torch.cat(parts) for parts in zip(*(s.points for s in samples.values()), strict=True)))
         field = self.field(points, create_graph=True)
-        fields = dict(zip(samples, (Field(*part) for part in zip(*(f.split(sizes) for f in field), strict=True)), strict=True))
+        fields = dict(
+            zip(samples, (Field(*part) for part in zip(*(f.split(sizes) for f in field), strict=True)), strict=True)
+        )
         scales = Scales(self.value_scale, self.costate_scale)
         losses: dict[str, Tensor] = {}
-        for name, term in self.losses.items():
+        for name in self.terms:
+            term = self.term(name)
             if term.stream in samples and self.weights.get(name, 0) > 0:
                 sample = samples[term.stream]
                 residual = term.residual(self.game, sample, fields[term.stream])

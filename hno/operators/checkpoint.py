@@ -31,7 +31,9 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
         raise CheckpointError(f"There is no checkpoint at {path}. Train one with `python train.py`.") from error
     except (RuntimeError, OSError, EOFError, pickle.UnpicklingError, zipfile.BadZipFile, KeyError, ValueError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise CheckpointError(f"{path} is not a readable checkpoint: truncated, foreign or unsafe ({reason}).") from error
+        raise CheckpointError(
+            f"{path} is not a readable checkpoint: truncated, foreign or unsafe ({reason})."
+        ) from error
     spec = content.get(SPEC_KEY) if isinstance(content, dict) else None
     if not isinstance(spec, dict) or spec.get("format") != SPEC_FORMAT or "state_dict" not in content:
         raise CheckpointError(f"{path} was not written by this version of hno: it lacks the entry {SPEC_KEY!r}.")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import torch
 from torch import Tensor, nn
 
@@ -19,9 +21,10 @@ class MLP(nn.Module):
     def __init__(self, sizes: tuple[int, ...], activation: str) -> None:
         super().__init__()
         self.activation = activations.get(activation)()
-        self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in zip(sizes[:-1], sizes[1:], strict=True))
-        for index, layer in enumerate(self.layers):
+        layers = [nn.Linear(a, b) for a, b in itertools.pairwise(sizes)]
+        for index, layer in enumerate(layers):
             self.activation.init_(layer, first=index == 0)
+        self.layers = nn.ModuleList(layers)
 
     def forward(self, z: Tensor) -> Tensor:
         """(..., inputs) -> (..., outputs), the last layer linear."""

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from typing import final
+from collections.abc import Mapping
+from typing import ClassVar, final
 
+from hno.losses.base import LossTerm
 from hno.losses.hji import Boundary, HJIResidual
 from hno.losses.supervised import CostateDeviation, ValueDeviation
 from hno.operators.base import ValueOperator, operators
@@ -14,4 +16,9 @@ from hno.operators.base import ValueOperator, operators
 class HybridNeuralOperator(ValueOperator):
     """Supervised by labels and by the HJI equation with its boundary condition."""
 
-    terms = {"value": ValueDeviation, "costate": CostateDeviation, "boundary": Boundary, "residual": HJIResidual}
+    terms: ClassVar[Mapping[str, type[LossTerm]]] = {
+        "value": ValueDeviation,
+        "costate": CostateDeviation,
+        "boundary": Boundary,
+        "residual": HJIResidual,
+    }

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from typing import final
+from collections.abc import Mapping
+from typing import ClassVar, final
 
+from hno.losses.base import LossTerm
 from hno.losses.supervised import CostateDeviation, ValueDeviation
 from hno.operators.base import ValueOperator, operators
 
@@ -13,4 +15,4 @@ from hno.operators.base import ValueOperator, operators
 class SupervisedNeuralOperator(ValueOperator):
     """Supervised by labels alone."""
 
-    terms = {"value": ValueDeviation, "costate": CostateDeviation}
+    terms: ClassVar[Mapping[str, type[LossTerm]]] = {"value": ValueDeviation, "costate": CostateDeviation}

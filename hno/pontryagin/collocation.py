@@ -16,7 +16,6 @@ from hno.games.base import own_costate
 from hno.pontryagin.adjoint import jacobian_rows, pmp_rate, pmp_rate_and_jacobian, terminal_costate
 from hno.types import Status
 
-
 BLOCK = 512
 """Points that are differentiated together: few enough for the processor's cache."""
 

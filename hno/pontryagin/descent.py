@@ -75,7 +75,9 @@ def _backward(model: Expansion, v: Tensor, damping: Tensor) -> tuple[Tensor, Ten
     return torch.stack(steps[::-1], 1), torch.stack(gains[::-1], 1)
 
 
-def _forward(problem: JointProblem, x: Tensor, v: Tensor, policy: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+def _forward(
+    problem: JointProblem, x: Tensor, v: Tensor, policy: tuple[Tensor, Tensor]
+) -> tuple[Tensor, Tensor, Tensor]:
     """The best of several step lengths for each row: states, scaled controls, cost."""
     steps, gains = policy
     lengths = torch.tensor(STEP_LENGTHS, dtype=v.dtype, device=v.device)

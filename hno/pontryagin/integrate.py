@@ -7,14 +7,14 @@ from torch import Tensor
 from hno.games import Game
 
 
-def runge_kutta(game: Game, x: Tensor, u: Tensor, dt: float) -> Tensor:
+def runge_kutta(game: Game, x: Tensor, u: Tensor, dt: float | Tensor) -> Tensor:
     """One classical Runge-Kutta step of the dynamics at held control.
 
     Args:
         game: the game.
         x: states, (B, P, n).
         u: controls, (B, P, m).
-        dt: step, s.
+        dt: step, s; a tensor must broadcast against x.
 
     Returns:
         States after the step, (B, P, n).

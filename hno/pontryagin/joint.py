@@ -15,7 +15,6 @@ from hno.games import Game
 from hno.pontryagin.adjoint import jacobian_rows
 from hno.pontryagin.integrate import runge_kutta
 
-
 BLOCK = 64
 """Rows that are expanded together: few enough for the processor's cache."""
 

@@ -61,7 +61,9 @@ def _check(game: Game, x0: Tensor, theta: Tensor) -> None:
     if x0.dim() != 3 or tuple(x0.shape[1:]) != expected or len(x0) == 0:
         raise ValueError(f"x0 must have shape (B, {expected[0]}, {expected[1]}) with B > 0; got {tuple(x0.shape)}.")
     if tuple(theta.shape) != (len(x0), game.players):
-        raise ValueError(f"theta must have shape ({len(x0)}, {game.players}), a type per player; got {tuple(theta.shape)}.")
+        raise ValueError(
+            f"theta must have shape ({len(x0)}, {game.players}), a type per player; got {tuple(theta.shape)}."
+        )
     for name, tensor in (("x0", x0), ("theta", theta)):
         if not bool(tensor.isfinite().all()):
             raise ValueError(f"{name} has entries that are not finite, first in row {_first_bad_row(tensor)}.")
@@ -136,8 +138,9 @@ def _describe(game: Game, at: Iterate, mesh: Mesh, residual: Tensor, status: Ten
     everywhere = torch.cat([x, middle_x], 1)
     gap = -game.constraint(everywhere, at.theta.unsqueeze(1).expand(everywhere.shape[:-1])).amax((1, 2))
     t = label_times(game, dtype=x.dtype, device=x.device)
-    on_labels = (part[rows, mesh.label_index] for part in (x, costate, u, value))
-    return Extremal(status, residual, t, *on_labels, at.theta, gap, alternatives=value[:, :1].sum(-1))
+    total = value[:, :1].sum(-1)
+    x, costate, u, value = (part[rows, mesh.label_index] for part in (x, costate, u, value))
+    return Extremal(status, residual, t, x, costate, u, value, at.theta, gap, total)
 
 
 def _best(found: Extremal, tried: Tensor) -> Extremal:

@@ -1,0 +1,245 @@
+"""`check_game` accepts games that keep the contract and names what is broken in games that do not."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from hno.games import Box, ControlAffineGame, make
+from hno.games.kinematics import double_integrator_drift, separation
+from hno.games.testing import ContractError, check_game
+from tests.lq import random_game
+
+
+class Encounter(ControlAffineGame):
+    """Points in the plane that keep apart: the sound game that every broken one below changes in one place."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.horizon, self.label_step = 2.0, 0.25
+        self.state_box = Box([[-4.0] * 4] * 2, [[4.0] * 4] * 2)
+        self.initial_box = Box([[-1.0] * 4] * 2, [[1.0] * 4] * 2)
+        self.control_box = Box([-1.0, -2.0], [1.0, 3.0])
+        self.type_box = Box([1.0, 1.0], [5.0, 5.0])
+        self.register_buffer("input_matrix", torch.eye(4)[:, 2:])
+        self.register_buffer("effort_weight", torch.tensor([2.0, 0.5]))
+
+    def drift(self, x: Tensor) -> Tensor:
+        return double_integrator_drift(x)
+
+    def terminal_value(self, x: Tensor) -> Tensor:
+        return -x.square().sum(-1)
+
+    def constraint(self, x: Tensor, theta: Tensor) -> Tensor:
+        return 0.1 * theta.sum(-1, keepdim=True) - separation(self.positions(x))
+
+    def sensors(self, theta: Tensor) -> Tensor:
+        return theta.unsqueeze(-1).expand(*theta.shape, 3) / 5
+
+
+class CoupledDynamics(Encounter):
+    def drift(self, x: Tensor) -> Tensor:
+        return super().drift(x) + 0.01 * x.flip(-2)
+
+
+class CoupledEffort(Encounter):
+    def effort(self, u: Tensor) -> Tensor:
+        return super().effort(u) + 0.1 * u.square().sum((-2, -1)).unsqueeze(-1)
+
+
+class CoupledResponse(Encounter):
+    def best_response(self, x: Tensor, own_costate: Tensor) -> Tensor:
+        return super().best_response(x, own_costate.mean(-2, keepdim=True).expand_as(own_costate))
+
+
+class DifferentTargets(Encounter):
+    def terminal_value(self, x: Tensor) -> Tensor:
+        return -(x[..., 0] - torch.tensor([1.0, 2.0], dtype=x.dtype)).square()
+
+
+class DifferentSensors(Encounter):
+    def sensors(self, theta: Tensor) -> Tensor:
+        return theta[..., :1].unsqueeze(-1).expand(*theta.shape, 3)
+
+
+class DifferentBoxes(Encounter):
+    def __init__(self) -> None:
+        super().__init__()
+        self.state_box = Box([[-4.0] * 4] * 2, [[4.0] * 4, [5.0] * 4])
+
+
+class BareNorm(Encounter):
+    def constraint(self, x: Tensor, theta: Tensor) -> Tensor:
+        distance = self.positions(x).diff(dim=-2).square().sum(-1).sqrt()
+        return 0.1 * theta.sum(-1, keepdim=True) - distance.expand_as(theta)
+
+
+class MirroredBareNorm(Encounter):
+    def positions(self, x: Tensor) -> Tensor:
+        return torch.stack([x[..., 0, :2], 1.75 - x[..., 1, :2]], -2)
+
+    def constraint(self, x: Tensor, theta: Tensor) -> Tensor:
+        distance = self.positions(x).diff(dim=-2).square().sum(-1).sqrt()
+        return 0.1 * theta.sum(-1, keepdim=True) - distance.expand_as(theta)
+
+
+class KinkedTerminal(Encounter):
+    def terminal_value(self, x: Tensor) -> Tensor:
+        return -x.abs().pow(1.5).sum(-1)
+
+
+class TwiceTheVertex(Encounter):
+    def best_response(self, x: Tensor, own_costate: Tensor) -> Tensor:
+        return super().best_response(x, 2 * own_costate)
+
+
+class SlightlyOff(Encounter):
+    def best_response(self, x: Tensor, own_costate: Tensor) -> Tensor:
+        return super().best_response(x, 1.02 * own_costate)
+
+
+class Minimiser(Encounter):
+    def best_response(self, x: Tensor, own_costate: Tensor) -> Tensor:
+        return super().best_response(x, -own_costate)
+
+
+class Unclamped(Encounter):
+    def best_response(self, x: Tensor, own_costate: Tensor) -> Tensor:
+        return own_costate @ self.input_matrix / (2 * self.effort_weight)
+
+
+class FixedBatch(Encounter):
+    def terminal_value(self, x: Tensor) -> Tensor:
+        return -torch.stack([x[:, 0, 0], x[:, 1, 0]], -1)
+
+
+class OtherShape(Encounter):
+    def effort(self, u: Tensor) -> Tensor:
+        return super().effort(u).unsqueeze(-1)
+
+
+class DoubleConstant(Encounter):
+    def terminal_value(self, x: Tensor) -> Tensor:
+        return super().terminal_value(x) + torch.ones(2, dtype=torch.float64)
+
+
+class FloatConstant(Encounter):
+    def terminal_value(self, x: Tensor) -> Tensor:
+        return torch.mv(torch.ones(2, 2), x[..., 0].flatten()[:2]).expand(x.shape[:-1])
+
+
+class InfiniteCost(Encounter):
+    def terminal_value(self, x: Tensor) -> Tensor:
+        return -x.sqrt().sum(-1)
+
+
+class NoSensors(Encounter):
+    def sensors(self, theta: Tensor) -> Tensor:
+        return super().sensors(theta)[..., :0]
+
+
+class OnALine(Encounter):
+    def positions(self, x: Tensor) -> Tensor:
+        return x[..., :1]
+
+
+class RewardedViolation(Encounter):
+    penalty_height = -1e4
+
+
+class OwnIdeaOfViolation(Encounter):
+    def violates(self, x: Tensor, theta: Tensor) -> Tensor:
+        return (self.constraint(x, theta) >= 0.5).any(-1)
+
+
+class Drifting(Encounter):
+    calls = 0
+
+    def constraint(self, x: Tensor, theta: Tensor) -> Tensor:
+        self.calls += 1
+        return super().constraint(x, theta) + 0.1 * self.calls
+
+
+class OutsideStart(Encounter):
+    def __init__(self) -> None:
+        super().__init__()
+        self.initial_box = Box([[-5.0] * 4] * 2, [[1.0] * 4] * 2)
+
+
+class OddHorizon(Encounter):
+    def __init__(self) -> None:
+        super().__init__()
+        self.horizon = 2.1
+
+
+class OnePlayerBox(Encounter):
+    def __init__(self) -> None:
+        super().__init__()
+        self.initial_box = Box([-1.0] * 4, [1.0] * 4)
+
+
+class FrozenChannel(Encounter):
+    def __init__(self) -> None:
+        super().__init__()
+        self.control_box = Box([-1.0, 0.0], [1.0, 0.0])
+
+
+@pytest.mark.parametrize("name", ["narrow_road", "lane_change", "drone"])
+def test_the_games_of_the_paper_keep_the_contract(name):
+    check_game(make(name))
+
+
+@pytest.mark.parametrize("players", [2, 3])
+def test_a_game_with_a_custom_penalty_keeps_the_contract(players):
+    check_game(random_game(players))
+
+
+def test_a_plain_game_keeps_the_contract_and_is_left_alone():
+    game = Encounter()
+    check_game(game)
+    assert game.state_box.lo.dtype == torch.float32
+    assert game.fingerprint() == Encounter().fingerprint()
+
+
+@pytest.mark.parametrize(
+    ("broken", "message"),
+    [
+        (CoupledDynamics, r"dynamics of each player that depends on its own .*Couple the players through `constraint`"),
+        (CoupledEffort, r"effort of each player that depends on its own .*Couple the players through `constraint`"),
+        (CoupledResponse, r"best_response of each player that depends on its own .*Couple the players through"),
+        (DifferentTargets, r"terminal_value to swap .*declare roles = \(0, 1\)"),
+        (DifferentSensors, r"sensors to swap .*declare roles = \(0, 1\)"),
+        (DifferentBoxes, r"state_box to swap .*declare roles = \(0, 1\)"),
+        (BareNorm, r"finite first derivatives of constraint where the players' positions coincide; .*separation"),
+        (MirroredBareNorm, r"finite first derivatives of constraint where the players' positions coincide; "),
+        (KinkedTerminal, r"finite second derivatives of terminal_value at the centres of the boxes"),
+        (TwiceTheVertex, r"no other control in control_box raises; got a gain of .*exact maximiser"),
+        (SlightlyOff, r"no other control in control_box raises; got a gain of .*exact maximiser"),
+        (Minimiser, r"no other control in control_box raises; got a gain of .*exact maximiser"),
+        (Unclamped, r"optimal_control inside control_box; got an excess of .*Clamp"),
+        (FixedBatch, r"terminal_value to accept batch shape \(\) in torch.float32; got IndexError.*last axes"),
+        (OtherShape, r"effort of shape \(2,\); got \(2, 1\)"),
+        (DoubleConstant, r"terminal_value of torch.float32 .*got torch.float64.*buffers"),
+        (FloatConstant, r"terminal_value to accept batch shape \(\) in torch.float64; got RuntimeError.*buffers"),
+        (InfiniteCost, r"finite terminal_value in state_box; got .*nan"),
+        (NoSensors, r"sensors of shape \(2, 1\); got \(2, 0\)"),
+        (OnALine, r"positions of shape \(2, 2\); got \(2, 1\)"),
+        (RewardedViolation, r"a penalty that grows with the constraint; .*Safe is a constraint below 0"),
+        (OwnIdeaOfViolation, r"violates where a constraint is at least 0; got a disagreement"),
+        (Drifting, r"one fingerprint for one game; .*pure functions"),
+        (OutsideStart, r"initial_box inside state_box; got .*-5.0.*Widen state_box"),
+        (OddHorizon, r"a whole multiple of label_step; got horizon 2.1 s, label_step 0.25 s"),
+        (OnePlayerBox, r"initial_box of shape \(2, 4\); got \(4,\).*one row per entry of `roles`"),
+        (FrozenChannel, r"positive edges of control_box; got \[2.0, 0.0\]"),
+    ],
+)
+def test_a_broken_promise_is_named_with_its_remedy(broken, message):
+    with pytest.raises(ContractError, match=r"(?s)Expected .*" + message):
+        check_game(broken())
+
+
+def test_a_game_with_declared_roles_may_treat_players_differently():
+    game = DifferentTargets()
+    game.roles = (0, 1)
+    check_game(game)
