@@ -20,7 +20,7 @@ from hno.cli.summary import report, show
 from hno.data.generate import Request, labels_for
 from hno.evaluation.closed_loop import TypeRow, collision_table
 from hno.evaluation.rollout import rollout
-from hno.operators.checkpoint import OperatorPolicy, load_policy
+from hno.operators.checkpoint import OperatorPolicy, load_operator
 from hno.report.picture import PlotsMissingError, rollout_picture, typical
 from hno.types import Extremal
 
@@ -55,7 +55,7 @@ def evaluate(config: DictConfig) -> bool:
 
 
 def _run(config: DictConfig, results: Results) -> None:
-    policy = load_policy(config.checkpoint)
+    policy = OperatorPolicy(load_operator(config.checkpoint, config.game))
     operator = policy.operator
     results.update(**operator.names())
     types = parse_types(config.theta, policy)

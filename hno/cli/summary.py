@@ -14,7 +14,7 @@ from rich.table import Table
 log = logging.getLogger(__name__)
 
 COLUMNS = ("theta", "labels", "safe", "collisions", "rate", "95 % interval", "distance", "excess cost", "apart")
-WIDTH = 110
+WIDTH = 120
 """Columns of text where there is no terminal to ask."""
 
 

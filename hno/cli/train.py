@@ -21,7 +21,7 @@ from hno.cli.results import Results, config_hash
 from hno.cli.summary import report, show
 from hno.evaluation.closed_loop import TypeRow
 from hno.losses import Scales
-from hno.operators.checkpoint import load_policy, read_checkpoint
+from hno.operators.checkpoint import check_resumable, load_policy
 
 log = logging.getLogger(__name__)
 
@@ -74,7 +74,7 @@ def _run(config: DictConfig, folder: Path, results: Results) -> None:
     check_evaluation(settings["starts"], settings["clearance"], settings["dt"])
     trainer = build_trainer(config, folder)
     if config.resume is not None:
-        read_checkpoint(config.resume)
+        check_resumable(config.resume, operator)
 
     data.prepare_data()
     data.setup("fit")

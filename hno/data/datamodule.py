@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -115,7 +116,8 @@ class GameData(L.LightningDataModule):
         for name, size in {"trajectories": trajectories, "validation": validation, **batch_sizes}.items():
             if size is not None and size < 1:
                 raise ValueError(f"The number of rows or trajectories {name!r} must be at least 1; got {size}.")
-        self.game, self.streams, self.seed = game, frozenset(streams), seed
+        self.game = copy.deepcopy(game)  # the operator moves its own to a device; batches are made on the CPU
+        self.streams, self.seed = frozenset(streams), seed
         self.type_list = [tuple(map(float, theta)) for theta in types]
         self.types = torch.tensor(self.type_list)
         self.batch_sizes, self.curriculum, self.shares = dict(batch_sizes), curriculum, dict(shares)
@@ -128,6 +130,8 @@ class GameData(L.LightningDataModule):
 
     def prepare_data(self) -> None:
         """Solve what the cache lacks."""
+        if self.extremals:
+            return
         arguments = self.game, self.requests, self.cache, self.solver, self.workers, self.progress
         self.extremals, self.label_seconds = labels_for(*arguments)
 

@@ -162,17 +162,20 @@ class ValueOperator(L.LightningModule, abc.ABC):
         self.costate_error(field.costate.flatten(1), sample.labels.costate.flatten(1))
         self.log_dict({"val/value_error": self.value_error, "val/costate_error": self.costate_error})
 
-    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Add what `hno.operators.checkpoint` needs to rebuild the operator."""
-        checkpoint[SPEC_KEY] = {
+    def spec(self) -> dict[str, Any]:
+        """What `hno.operators.checkpoint` needs to rebuild the operator, plain containers."""
+        return {
             "format": SPEC_FORMAT,
-            "game": games.name_of(type(self.game)),
+            **self.names(),
             "constants": dict(self.game.constants),
             "fingerprint": self.game.fingerprint(),
-            "operator": operators.name_of(type(self)),
             "options": self.options,
             "seen_types": self.seen_types,
         }
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Add the operator's `spec`."""
+        checkpoint[SPEC_KEY] = self.spec()
 
     def configure_optimizers(self) -> Any:
         """What the `optimizer` argument builds."""

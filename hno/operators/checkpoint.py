@@ -40,6 +40,19 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
     return content
 
 
+def check_resumable(path: str | Path, operator: ValueOperator) -> None:
+    """Refuse to resume from a checkpoint that is not of this operator.
+
+    Raises:
+        CheckpointError: see `read_checkpoint`; or the checkpoint is of another game, operator or network.
+    """
+    found, expected = read_checkpoint(path)[SPEC_KEY], operator.spec()
+    differing = [name for name in expected if name != "seen_types" and found.get(name) != expected[name]]
+    if differing:
+        pairs = "; ".join(f"{name} {found.get(name)!r}, expected {expected[name]!r}" for name in differing)
+        raise CheckpointError(f"{path} is a checkpoint of something else: {pairs}. Resume with its own configuration.")
+
+
 def load_operator(path: str | Path, game: str | None = None) -> ValueOperator:
     """The trained operator in a checkpoint, in evaluation mode.
 

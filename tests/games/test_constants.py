@@ -58,11 +58,10 @@ def states(game) -> Tensor:
     return game.state_box.sample(len(TYPES), torch.Generator().manual_seed(0))
 
 
-def test_radii_at_the_types_that_the_paper_names(name):
+def test_radii_at_the_types_that_the_facts_name(name, game, states):
     theta = torch.tensor([[1.0, 1.0], [1.0, 5.0], [5.0, 5.0]], dtype=torch.float64)
-    offset = BASE_RADIUS[name] - 1.25
-    expected = torch.tensor([1.5, 1.9, 2.5], dtype=torch.float64) + offset
-    torch.testing.assert_close(radius(name, theta), expected)
+    found = game.constraint(states[:3], theta)[:, 0] + distance(name, states[:3])
+    assert (found - BASE_RADIUS[name] + 1.25).tolist() == pytest.approx([1.5, 1.9, 2.5])
 
 
 def test_constraint_is_radius_minus_distance_at_every_type(name, game, states):

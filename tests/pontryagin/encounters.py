@@ -1,0 +1,34 @@
+"""States of the games of the paper in which the penalty acts."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from hno.games import Game, make
+
+NAMES = ("narrow_road", "lane_change", "drone")
+ENCOUNTERS = {
+    "narrow_road": [[34.6, 4.5, 0.03, 21.0], [35.3, 3.2, -0.02, 19.0]],
+    "lane_change": [[40.0, 3.0, 0.05, 20.0], [41.4, 5.3, -0.06, 22.0]],
+    "drone": [[2.2, 2.8, 0.3, 2.5, 3.0, 0.1], [2.5, 1.7, -0.2, 3.1, 2.2, -0.2]],
+}
+
+
+def encounters(name: str, size: int = 16) -> tuple[Game, Tensor, Tensor]:
+    """A float64 game, states (size, 2, n) around an encounter, and types (size, 2)."""
+    game, generator = make(name).double(), torch.Generator().manual_seed(0)
+    base = torch.tensor(ENCOUNTERS[name], dtype=torch.float64)
+    jitter = 0.005 * game.state_box.width * torch.randn(size, *base.shape, generator=generator, dtype=torch.float64)
+    return game, base + jitter, game.type_box.sample(size, generator)
+
+
+def central_difference(function, point: Tensor, step: float = 1e-5) -> Tensor:
+    """d function / d point for a function of (..., P, n) with value (..., P), shape (..., P, P, n)."""
+    slopes = []
+    for j in range(point.shape[-2]):
+        for k in range(point.shape[-1]):
+            shift = torch.zeros_like(point)
+            shift[..., j, k] = step
+            slopes.append((function(point + shift) - function(point - shift)) / (2 * step))
+    return torch.stack(slopes, -1).unflatten(-1, point.shape[-2:])
