@@ -70,6 +70,9 @@ class LinearQuadratic(Game):
     def sensors(self, theta: Tensor) -> Tensor:
         return theta.unsqueeze(-1)
 
+    def positions(self, x: Tensor) -> Tensor:
+        return x[..., :2]
+
     def best_response(self, x: Tensor, own_costate: Tensor) -> Tensor:
         return self.control_box.clamp(torch.einsum("pik,...pi->...pk", self.b, own_costate) / (2 * self.r))
 

@@ -26,19 +26,25 @@ def plain(config: DictConfig) -> dict[str, Any]:
     return {str(key): value for key, value in content.items()}
 
 
-POSITIVE = (
+SIZES = (
     "operator.width", "operator.depth", "data.trajectories", "data.validation", "data.workers", "trainer.max_steps",
-    "trainer.validate_every", "trainer.print_every", "trainer.threads", "optimizer.lr", "evaluation.starts",
+    "trainer.validate_every", "trainer.print_every", "trainer.threads", "evaluation.starts",
 )  # fmt: skip
-"""Entries that must be positive where they are set."""
+"""Entries that must be whole and positive where they are set."""
 
 
 def check_numbers(config: DictConfig) -> None:
     """Raise ValueError for sizes and rates that are not positive, and shares of the run outside [0, 1]."""
-    for name in POSITIVE:
+    for name in SIZES:
         value = OmegaConf.select(config, name)
-        if value is not None and not (isinstance(value, (int, float)) and value > 0):
-            raise ValueError(f"{name} must be a positive number; got {value!r}.")
+        if value is not None and not (isinstance(value, int) and value > 0):
+            raise ValueError(f"{name} must be a positive whole number; got {value!r}.")
+    if not (isinstance(config.optimizer.lr, (int, float)) and config.optimizer.lr > 0):
+        raise ValueError(f"optimizer.lr must be a positive number; got {config.optimizer.lr!r}.")
+    if not (isinstance(config.seed, int) and config.seed >= 0):
+        raise ValueError(f"seed must be a whole number of at least 0; got {config.seed!r}.")
+    if not (OmegaConf.is_list(config.data.types) and config.data.types):
+        raise ValueError(f"data.types must list player types, such as [[1, 1], [5, 5]]; got {config.data.types!r}.")
     for name in ("data.pretrain", "data.widening"):
         value = OmegaConf.select(config, name)
         if not (isinstance(value, (int, float)) and 0 <= value <= 1):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import sys
 from collections.abc import Callable, Sequence
@@ -10,7 +11,9 @@ from typing import Any
 
 import hydra
 from hydra.core.config_store import ConfigStore
+from hydra.errors import HydraException
 from omegaconf import DictConfig
+from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
 import hno
 from hno.games import games
@@ -54,12 +57,21 @@ def check_choices(arguments: Sequence[str]) -> None:
     """
     groups = {path.name for path in config_dir().iterdir() if path.is_dir()}
     for argument in arguments:
-        match = re.fullmatch(r"\+?([a-z_]+)=([\w,]+)", argument)
+        match = re.fullmatch(r"\+?([a-z_]+)=([\w.,-]+)", argument)
         if match is None or match[1] not in groups:
             continue
         for name in match[2].split(","):
             if name not in (*choices(match[1]), "null", ""):
                 sys.exit(unknown_name(match[1], name, choices(match[1])))
+
+
+def explain(error: Exception) -> str:
+    """The message of a configuration error; unknown keys come with the known ones and the nearest."""
+    cause = error.__cause__
+    if isinstance(cause, (ConfigAttributeError, ConfigKeyError)) and isinstance(cause.parent_node, DictConfig):
+        known = sorted(str(key) for key in cause.parent_node)
+        return f"{cause.full_key} does not exist. " + unknown_name("configuration key", str(cause.key), known)
+    return str(error)
 
 
 def run_command(config_name: str, task: Callable[[DictConfig], bool]) -> None:
@@ -73,6 +85,7 @@ def run_command(config_name: str, task: Callable[[DictConfig], bool]) -> None:
     sys.argv[1:] = [re.sub(r"^theta=([^'\"]*[,;].*)$", r"theta='\1'", argument) for argument in sys.argv[1:]]
     register_plugins()
     outcomes: list[bool] = []
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # exceptions reach this function; it says what they mean
 
     def job(config: DictConfig) -> None:
         outcomes.append(task(config))
@@ -81,5 +94,7 @@ def run_command(config_name: str, task: Callable[[DictConfig], bool]) -> None:
         hydra.main(version_base="1.3", config_path=str(config_dir()), config_name=config_name)(job)()
     except OSError as error:
         sys.exit(f"The output folder cannot be written ({error}). Choose another with hydra.run.dir=<folder>.")
+    except (HydraException, OmegaConfBaseException) as error:
+        sys.exit(explain(error))
     if not all(outcomes):
         sys.exit(1)

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from hno.cli.build import cache_folder
 from hno.cli.config import run_command
@@ -19,7 +19,8 @@ from hno.cli.results import Results, config_hash
 from hno.cli.summary import report, show
 from hno.data.generate import Request, labels_for
 from hno.evaluation.closed_loop import TypeRow, collision_table
-from hno.evaluation.rollout import rollout
+from hno.evaluation.rollout import control_steps, rollout
+from hno.games import Game
 from hno.operators.checkpoint import OperatorPolicy, load_operator
 from hno.report.picture import PlotsMissingError, rollout_picture, typical
 from hno.types import Extremal
@@ -42,6 +43,9 @@ def evaluate(config: DictConfig) -> bool:
         Whether it succeeded. A failure has been logged and is in results.json.
     """
     send_lightning_to_hydra()
+    if OmegaConf.is_missing(config, "checkpoint"):
+        log.error("Say which checkpoint to evaluate: python evaluate.py checkpoint=<path to last.ckpt>")
+        return False
     folder = Path(HydraConfig.get().runtime.output_dir)
     results = Results(folder / "results.json", {"checkpoint": config.checkpoint, "config_hash": config_hash(config)})
     try:
@@ -100,7 +104,7 @@ def evaluate_policy(
     dt: float,
 ) -> list[TypeRow]:
     """Solve the test starts where the cache lacks them, roll out, and put the table into the results."""
-    check_evaluation(starts, clearance, dt)
+    check_evaluation(policy.game, starts, clearance, dt)
     requests = [Request(theta, starts, seed, "test") for theta in types]
     labels, seconds = labels_for(policy.game, requests, cache, workers=workers, progress=label_progress())
     results.time("test_labels", seconds)
@@ -108,14 +112,14 @@ def evaluate_policy(
     table = collision_table(policy.game, policy, labels, policy.operator.seen_types, clearance, dt)
     results.time("evaluation", time.perf_counter() - began)
     results.update(clearance=clearance, dt=dt, test_seed=seed, table=[row._asdict() for row in table])
-    draw(policy, labels[0], results.path.parent / "rollout.png")
+    draw(policy, labels[0], results.path.parent / "rollout.png", dt)
     return table
 
 
-def draw(policy: OperatorPolicy, found: Extremal, path: Path, episodes: int = 15) -> None:
+def draw(policy: OperatorPolicy, found: Extremal, path: Path, dt: float, episodes: int = 15) -> None:
     """Draw a typical episode from the first starts of a label set; without matplotlib, say so."""
     starts, theta = found.x[:episodes, 0].float(), found.theta[:episodes].float()
-    played = rollout(policy.game, policy, starts, theta)
+    played = rollout(policy.game, policy, starts, theta, dt)
     names = policy.operator.names()
     try:
         rollout_picture(policy.game, played, theta, path, " / ".join(names.values()), typical(played))
@@ -123,11 +127,10 @@ def draw(policy: OperatorPolicy, found: Extremal, path: Path, episodes: int = 15
         log.info("No picture: %s", error)
 
 
-def check_evaluation(starts: int, clearance: float, dt: float) -> None:
-    """Raise ValueError for sizes that make no evaluation."""
+def check_evaluation(game: Game, starts: int, clearance: float, dt: float) -> None:
+    """Raise ValueError for sizes that make no evaluation of the game."""
     if starts < 1:
         raise ValueError(f"starts must be at least 1 per type; got {starts}.")
     if not (math.isfinite(clearance) and clearance >= 0):
         raise ValueError(f"clearance must be a finite distance of at least 0 m; got {clearance}.")
-    if not (math.isfinite(dt) and dt > 0):
-        raise ValueError(f"dt must be a positive time in s; got {dt}.")
+    control_steps(game, dt)

@@ -19,7 +19,7 @@ from lightning.pytorch.loggers import CSVLogger, Logger, WandbLogger
 from omegaconf import DictConfig, OmegaConf
 
 from hno.data.generate import Progress
-from hno.registry import unknown_name
+from hno.registry import UnknownNameError, unknown_name
 
 log = logging.getLogger(__name__)
 
@@ -29,6 +29,7 @@ LOGGERS = ("csv", "wandb")
 def send_lightning_to_hydra() -> None:
     """Let Lightning's messages and Python's warnings reach Hydra's handlers, console and file."""
     logging.captureWarnings(True)
+    warnings.formatwarning = lambda message, category, *_, **__: f"{category.__name__}: {message}"
     warnings.filterwarnings("ignore", message=".*exists and is not empty")  # results.json is there first, on purpose
     warnings.filterwarnings("ignore", message=".*isinstance.treespec, LeafSpec.")  # Lightning's own, from torch 2.13 on
     warnings.filterwarnings("ignore", message=".*does not have many workers")  # batches are made in memory
@@ -43,12 +44,12 @@ def loggers(config: DictConfig, folder: Path) -> list[Logger]:
     """The chosen loggers.
 
     Raises:
-        KeyError: unknown logger.
+        UnknownNameError: unknown logger.
     """
     made: list[Logger] = []
     for name in config.logger.names:
         if name not in LOGGERS:
-            raise KeyError(unknown_name("logger", name, list(LOGGERS)))
+            raise UnknownNameError(unknown_name("logger", name, list(LOGGERS)))
         if name == "csv":
             made.append(CSVLogger(folder, name="", version="csv"))
         elif config.logger.mode != "disabled":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 import platform
 import tempfile
@@ -38,6 +39,15 @@ def versions() -> dict[str, str]:
     return {"hno": hno.__version__, "python": platform.python_version(), **{name: version(name) for name in PACKAGES}}
 
 
+def finite(content: Any) -> Any:
+    """JSON content with null for numbers that JSON does not know: NaN and infinities."""
+    if isinstance(content, Mapping):
+        return {key: finite(value) for key, value in content.items()}
+    if isinstance(content, (list, tuple)):
+        return [finite(value) for value in content]
+    return None if isinstance(content, float) and not math.isfinite(content) else content
+
+
 class Results:
     """The content of a results.json, written after every part of a run.
 
@@ -66,7 +76,7 @@ class Results:
 
     def write(self) -> None:
         """Write under a temporary name, then rename into place."""
-        text = json.dumps(self.content, indent=2, allow_nan=False)
+        text = json.dumps(finite(self.content), indent=2, allow_nan=False)
         self.path.parent.mkdir(parents=True, exist_ok=True)
         handle, temporary = tempfile.mkstemp(dir=self.path.parent, prefix=".results.")
         with os.fdopen(handle, "w") as file:

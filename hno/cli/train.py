@@ -71,7 +71,7 @@ def _run(config: DictConfig, folder: Path, results: Results) -> None:
     operator.seen_types = data.type_list
     types = list(dict.fromkeys(operator.seen_types + game.validate_types(config.evaluation.types)))
     settings = {name: config.evaluation[name] for name in ("starts", "seed", "clearance", "dt")}
-    check_evaluation(settings["starts"], settings["clearance"], settings["dt"])
+    check_evaluation(game, settings["starts"], settings["clearance"], settings["dt"])
     trainer = build_trainer(config, folder)
     if config.resume is not None:
         check_resumable(config.resume, operator)
@@ -84,6 +84,9 @@ def _run(config: DictConfig, folder: Path, results: Results) -> None:
 
     began = time.perf_counter()
     trainer.fit(operator, datamodule=data, ckpt_path=config.resume, weights_only=True)
+    trainer.save_checkpoint(
+        folder / "last.ckpt", weights_only=False
+    )  # the last step need not be a multiple of trainer.validate_every
     results.time("training", time.perf_counter() - began)
     metrics = {name: float(value) for name, value in trainer.callback_metrics.items()}
     results.update(steps=trainer.global_step, checkpoint="last.ckpt", metrics=metrics)

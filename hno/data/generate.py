@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import tempfile
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -82,7 +83,8 @@ def labels_for(
     paths = [label_path(game, request, cache, settings) for request in requests]
     missing = [index for index, path in enumerate(paths) if not path.exists()]
     found: dict[int, Extremal] = {i: read_labels(path)[0] for i, path in enumerate(paths) if i not in missing}
-    cache.mkdir(parents=True, exist_ok=True)
+    if missing:
+        _check_writable(cache)
     jobs = [(i, part) for i in missing for part in start_states(game, requests[i]).split(settings.chunk)]
     pieces: dict[int, list[Extremal]] = {i: [] for i in missing}
     waiting = {i: sum(job[0] == i for job in jobs) for i in missing}
@@ -96,6 +98,15 @@ def labels_for(
             found[index] = join(pieces.pop(index))
             write_labels(paths[index], found[index], provenance(game, requests[index], settings))
     return [found[i] for i in range(len(requests))], time.perf_counter() - began
+
+
+def _check_writable(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise OSError(f"Labels cannot be written to {folder} ({error}). Choose another folder with $HNO_CACHE.") from error
 
 
 def label_path(game: Game, request: Request, cache: Path, settings: Solver) -> Path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import torch
@@ -15,9 +16,10 @@ SOURCES = ("box", "band", "labels")
 
 
 def check_shares(shares: Mapping[str, float]) -> None:
-    """Raise ValueError unless the shares name known sources, are not negative and do not all vanish."""
+    """Raise ValueError unless the shares name known sources, are finite, not negative and do not all vanish."""
     unknown = set(shares) - set(SOURCES)
-    if unknown or any(share < 0 for share in shares.values()) or sum(shares.values()) <= 0:
+    sound = all(math.isfinite(share) and share >= 0 for share in shares.values())
+    if unknown or not sound or sum(shares.values()) <= 0:
         raise ValueError(
             f"Sampler shares must be nonnegative numbers for {', '.join(SOURCES)}, not all 0; got {dict(shares)}."
         )

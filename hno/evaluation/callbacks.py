@@ -15,7 +15,7 @@ class DivergedError(RuntimeError):
 
 
 class StopOnDivergence(L.Callback):
-    """Raise as soon as the loss is not finite.
+    """Raise as soon as the loss, or at the end a weight, is not finite.
 
     The test looks every `every` steps, because it waits for the device.
 
@@ -33,13 +33,20 @@ class StopOnDivergence(L.Callback):
         last = trainer.global_step == trainer.max_steps
         if (trainer.global_step % self.every == 0 or last) and not bool(torch.isfinite(outputs["loss"])):
             raise DivergedError(
-                f"The loss is {float(outputs['loss'])} at step {trainer.global_step}: the training diverged. "
-                "Lower optimizer.lr or set trainer.gradient_clip_val; last.ckpt holds the last validated state."
+                f"The loss is {float(outputs['loss'])} at step {trainer.global_step}: the training diverged. {_ADVICE}"
             )
+
+    def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Test the weights, which the last step changed after its loss."""
+        if not all(bool(weights.isfinite().all()) for weights in pl_module.parameters()):
+            raise DivergedError(f"The last step left weights that are not finite: the training diverged. {_ADVICE}")
+
+
+_ADVICE = "Lower optimizer.lr or set trainer.gradient_clip_val."
 
 
 def checkpoints(folder: Path, every: int) -> ModelCheckpoint:
-    """Keep `last.ckpt` in the folder, written every so many steps and at the end."""
+    """Keep `last.ckpt` in the folder, written every so many steps."""
     return ModelCheckpoint(
         dirpath=folder,
         filename="last",

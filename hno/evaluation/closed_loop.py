@@ -95,7 +95,7 @@ def _row(
         unsolved=int((~solved).sum()),
         inevitable=int((solved & (found.clearance <= 0)).sum()),
         marginal=int(marginal.sum()),
-        marginal_collisions=int((marginal & (played <= 0)).sum()),
+        marginal_collisions=int((marginal & ~(played > 0)).sum()),
         safe_starts=counted,
         collisions=collisions,
         rate=collisions / counted if counted else None,

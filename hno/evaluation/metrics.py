@@ -24,10 +24,10 @@ class CollisionRate(Metric):
         """Add episodes.
 
         Args:
-            clearance: smallest -constraint of each, (B,); a collision is 0 or less.
+            clearance: smallest -constraint of each, (B,); a collision is whatever is not above 0, NaN too.
             counted: which of them count, (B,).
         """
-        self.collisions += ((clearance <= 0) & counted).sum()
+        self.collisions += (~(clearance > 0) & counted).sum()
         self.episodes += counted.sum()
 
     def compute(self) -> Tensor:

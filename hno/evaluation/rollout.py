@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import torch
@@ -30,8 +31,11 @@ def rollout(
         dt: time for which a control is held, s.
         substeps: Runge-Kutta steps within `dt`.
         points: states, interpolated within each of these, at which constraint and penalty are evaluated.
+
+    Raises:
+        ValueError: the horizon is not a whole multiple of `dt`.
     """
-    steps = round(game.horizon / dt)
+    steps = control_steps(game, dt)
     x, value = x0, torch.zeros_like(theta)
     clearance = distance = torch.full_like(theta[:, 0], torch.inf)
     path, controls = [x], []
@@ -52,6 +56,18 @@ def rollout(
     t = torch.linspace(0, game.horizon, steps + 1, dtype=x0.dtype, device=x0.device)
     value = value + game.terminal_value(x)
     return Trajectory(t, torch.stack(path, 1), torch.stack(controls, 1), value, clearance, distance)
+
+
+def control_steps(game: Game, dt: float) -> int:
+    """Number of controls that an episode holds for `dt` each.
+
+    Raises:
+        ValueError: the horizon is not a whole multiple of `dt`.
+    """
+    steps = game.horizon / dt if math.isfinite(dt) and dt > 0 else 0.0
+    if round(steps) < 1 or abs(steps - round(steps)) > 1e-6:
+        raise ValueError(f"dt must be a positive time that divides the horizon of {game.horizon:g} s; got {dt:g} s.")
+    return round(steps)
 
 
 def _between(start: Tensor, end: Tensor, points: int) -> Tensor:

@@ -123,9 +123,9 @@ class Game(nn.Module, abc.ABC):
     def best_response(self, x: Tensor, own_costate: Tensor) -> Tensor:
         """Argmax of each player's Hamiltonian over its control box, (B, P, n), (B, P, n) -> (B, P, m)."""
 
+    @abc.abstractmethod
     def positions(self, x: Tensor) -> Tensor:
-        """Where the players are in one common frame, m, for pictures, (B, P, n) -> (B, P, 2 or 3)."""
-        return x[..., :2]
+        """Where the players are in one common frame, m, (B, P, n) -> (B, P, 2 or 3); distances and pictures use it."""
 
     @property
     def players(self) -> int:
@@ -171,9 +171,9 @@ class Game(nn.Module, abc.ABC):
         """
         checked = []
         for theta in types:
-            entries = tuple(float(entry) for entry in theta)
+            entries = _numbers(theta)
             if len(entries) != self.players or not all(map(math.isfinite, entries)):
-                raise ValueError(f"theta must be {self.players} finite numbers, one per player; got {tuple(theta)}.")
+                raise ValueError(f"theta must be {self.players} finite numbers, one per player; got {theta!r}.")
             if not bool(self.type_box.contains(torch.tensor(entries, device=self.type_box.lo.device))):
                 lo, hi = self.type_box.lo.tolist(), self.type_box.hi.tolist()
                 message = f"theta = {entries} lies outside the types {lo} to {hi} of the game: results extrapolate."
@@ -233,22 +233,14 @@ class ControlAffineGame(Game):
         return self.control_of(vertex.clamp(*map(self.affine_input, (self.control_box.lo, self.control_box.hi))))
 
 
+def _numbers(entries: object) -> tuple[float, ...]:
+    """Entries of a sequence as floats; none if it is no sequence of numbers."""
+    try:
+        return tuple(float(entry) for entry in entries)  # type: ignore[attr-defined]
+    except (TypeError, ValueError):
+        return ()
+
+
 def own_costate(costate: Tensor) -> Tensor:
     """The diagonal dV_i / dx_i of a costate, (B, P, P, n) -> (B, P, n)."""
     return costate.diagonal(dim1=-3, dim2=-2).mT
-
-
-def lattice_indicator(radius: Tensor, first: float, spacing: float, size: int) -> Tensor:
-    """1 where a distance lattice lies below the radius, shape (..., size).
-
-    The comparison is made in lattice steps with a tolerance of a thousandth of a step, so that float rounding does not
-    decide about a radius that falls on a lattice node.
-
-    Args:
-        radius: collision radius, m, shape (...).
-        first: distance of the first node, m.
-        spacing: lattice spacing, m.
-        size: number of nodes.
-    """
-    steps = (radius.unsqueeze(-1) - first) / spacing
-    return (torch.arange(size, device=radius.device) < steps - 1e-3).to(radius.dtype)

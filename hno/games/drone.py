@@ -7,13 +7,14 @@ from typing import final
 import torch
 from torch import Tensor
 
-from hno.games.base import Box, ControlAffineGame, games, lattice_indicator
-from hno.games.kinematics import GRAVITY, collision_radius, double_integrator_drift, separation
+from hno.games.base import Box, games
+from hno.games.collision import CollisionAvoidance
+from hno.games.kinematics import GRAVITY, double_integrator_drift
 
 
 @final
 @games.register("drone")
-class Drone(ControlAffineGame):
+class Drone(CollisionAvoidance):
     """Points (px, py, pz, vx, vy, vz); controls (roll, pitch, thrust) in the paper's words, rad, rad and m/s^2.
 
     The dynamics are affine in (tan roll, tan pitch, thrust - g).
@@ -27,6 +28,7 @@ class Drone(ControlAffineGame):
     def __init__(self, width: float = 5.0, radius: float = 0.5, horizon: float = 4.0) -> None:
         super().__init__()
         self.width, self.radius, self.horizon = width, radius, horizon
+        self.first_sensor, self.sensor_count = radius, 30
         self.state_box = Box([[0, 0, -2.2, 0.3, 0.3, -2]] * 2, [[15.5, 15.5, 2.5, 4.5, 4.5, 2.2]] * 2)
         self.initial_box = Box([[0, 0, -0.1, 2, 2, 0]] * 2, [[1, 1, 0.1, 4, 4, 0.1]] * 2)
         self.control_box = Box([-0.05, -0.05, GRAVITY - 2], [0.05, 0.05, GRAVITY + 2])
@@ -56,11 +58,3 @@ class Drone(ControlAffineGame):
         """Hover at height 0, (B, 2)."""
         forward = x[..., :2].sum(-1)
         return 1e-6 * forward - x[..., 2:].square().sum(-1)
-
-    def constraint(self, x: Tensor, theta: Tensor) -> Tensor:
-        """Collision radius minus distance, m, (B, 2)."""
-        return collision_radius(theta, self.radius) - separation(self.positions(x))
-
-    def sensors(self, theta: Tensor) -> Tensor:
-        """Violation set along the distance axis, every 0.05 m, (B, 2, 30)."""
-        return lattice_indicator(collision_radius(theta, self.radius), self.radius, 0.05, 30)

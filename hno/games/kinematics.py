@@ -37,9 +37,3 @@ def separation(positions: Tensor, softness: float = 1e-6) -> Tensor:
     distance = (offset.square().sum(-1) + softness**2).sqrt()
     alone = torch.eye(positions.shape[-2], dtype=torch.bool, device=positions.device)
     return distance.masked_fill(alone, torch.inf).amin(-1)
-
-
-def collision_radius(theta: Tensor, base: float) -> Tensor:
-    """Radius 0.1 sum_j theta_j + 0.05 min_j theta_j + base (paper, sec. IV), m, (..., P) -> (..., P)."""
-    radius = 0.1 * theta.sum(-1, keepdim=True) + 0.05 * theta.amin(-1, keepdim=True) + base
-    return radius.expand_as(theta)

@@ -7,13 +7,14 @@ from typing import final
 import torch
 from torch import Tensor
 
-from hno.games.base import Box, ControlAffineGame, games, lattice_indicator
-from hno.games.kinematics import DEGREE, collision_radius, separation, unicycle_drift
+from hno.games.base import Box, games
+from hno.games.collision import CollisionAvoidance
+from hno.games.kinematics import DEGREE, unicycle_drift
 
 
 @final
 @games.register("lane_change")
-class LaneChange(ControlAffineGame):
+class LaneChange(CollisionAvoidance):
     """Unicycles (px, py, psi, v) with different target lanes; controls (angular velocity, acceleration).
 
     Args:
@@ -35,6 +36,7 @@ class LaneChange(ControlAffineGame):
     ) -> None:
         super().__init__()
         self.speed, self.radius, self.horizon = speed, radius, horizon
+        self.first_sensor, self.sensor_count = radius - 0.25, 40
         self.register_buffer("lanes", torch.tensor(lanes))
         self.state_box = Box([[0, 0, -0.17, 17], [0, 2, -0.15, 17]], [[90, 6, 0.15, 26], [90, 8, 0.17, 26]])
         self.initial_box = Box(
@@ -49,16 +51,12 @@ class LaneChange(ControlAffineGame):
         """Motion at zero control, (B, 2, 4)."""
         return unicycle_drift(x)
 
+    def positions(self, x: Tensor) -> Tensor:
+        """(px, py) of both players in the same frame, m, (B, 2, 2)."""
+        return x[..., :2]
+
     def terminal_value(self, x: Tensor) -> Tensor:
         """Reach the other lane, straight and at nominal speed, (B, 2)."""
         along, across, heading, speed = x.unbind(-1)
         miss = (across - self.lanes).square() + (speed - self.speed).square() + 100 * heading.square()
         return 1e-6 * along - miss
-
-    def constraint(self, x: Tensor, theta: Tensor) -> Tensor:
-        """Collision radius minus distance, m, (B, 2)."""
-        return collision_radius(theta, self.radius) - separation(self.positions(x))
-
-    def sensors(self, theta: Tensor) -> Tensor:
-        """Violation set along the distance axis, every 0.05 m, (B, 2, 40)."""
-        return lattice_indicator(collision_radius(theta, self.radius), self.radius - 0.25, 0.05, 40)

@@ -7,13 +7,14 @@ from typing import final
 import torch
 from torch import Tensor
 
-from hno.games.base import Box, ControlAffineGame, games, lattice_indicator
-from hno.games.kinematics import DEGREE, collision_radius, separation, unicycle_drift
+from hno.games.base import Box, games
+from hno.games.collision import CollisionAvoidance
+from hno.games.kinematics import DEGREE, unicycle_drift
 
 
 @final
 @games.register("narrow_road")
-class NarrowRoad(ControlAffineGame):
+class NarrowRoad(CollisionAvoidance):
     """Unicycles (px, py, psi, v), each driving towards the other; controls (angular velocity, acceleration).
 
     Args:
@@ -29,6 +30,7 @@ class NarrowRoad(ControlAffineGame):
     ) -> None:
         super().__init__()
         self.length, self.lane, self.speed, self.radius, self.horizon = length, lane, speed, radius, horizon
+        self.first_sensor, self.sensor_count = radius - 0.25, 50
         self.state_box = Box([[15, 0, -0.2, 18]] * 2, [[95, 8, 0.2, 29]] * 2)
         self.initial_box = Box([[15, 3.25, -DEGREE, 18]] * 2, [[20, 4.75, DEGREE, 25]] * 2)
         self.control_box = Box([-1, -5], [1, 10])
@@ -49,11 +51,3 @@ class NarrowRoad(ControlAffineGame):
         """Stay in the lane at nominal speed, (B, 2)."""
         along, across, _, speed = x.unbind(-1)
         return 1e-6 * along - (speed - self.speed).square() - (across - self.lane).square()
-
-    def constraint(self, x: Tensor, theta: Tensor) -> Tensor:
-        """Collision radius minus distance, m, (B, 2)."""
-        return collision_radius(theta, self.radius) - separation(self.positions(x))
-
-    def sensors(self, theta: Tensor) -> Tensor:
-        """Violation set along the distance axis, every 0.05 m, (B, 2, 50)."""
-        return lattice_indicator(collision_radius(theta, self.radius), self.radius - 0.25, 0.05, 50)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import math
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, ClassVar
 
@@ -70,6 +71,8 @@ class ValueOperator(L.LightningModule, abc.ABC):
         self.weights = {
             name: float(w) for name, w in (weights or dict.fromkeys(self.terms, 1.0)).items() if name in self.terms
         }
+        if not any(weight > 0 for weight in self.weights.values()) or not all(map(_is_weight, self.weights.values())):
+            raise ValueError(f"Loss weights must be finite, not negative and not all 0; got {self.weights}.")
         players, states = game.players, game.state_dim
         self.has_roles = len(set(game.roles)) > 1
         sensors = game.sensors((game.type_box.lo + game.type_box.hi) / 2).shape[-1]
@@ -182,6 +185,10 @@ class ValueOperator(L.LightningModule, abc.ABC):
         if self.optimizer is None:
             raise ValueError("This operator was built without an optimizer; pass one to train it.")
         return self.optimizer(self.net.parameters())
+
+
+def _is_weight(number: float) -> bool:
+    return math.isfinite(number) and number >= 0
 
 
 def ego_views(x: Tensor, *, inverse: bool = False) -> Tensor:

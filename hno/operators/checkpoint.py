@@ -29,15 +29,25 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError as error:
         raise CheckpointError(f"There is no checkpoint at {path}. Train one with `python train.py`.") from error
-    except (RuntimeError, OSError, EOFError, pickle.UnpicklingError, zipfile.BadZipFile, KeyError, ValueError) as error:
+    except _UNREADABLE as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise CheckpointError(
             f"{path} is not a readable checkpoint: truncated, foreign or unsafe ({reason})."
         ) from error
     spec = content.get(SPEC_KEY) if isinstance(content, dict) else None
-    if not isinstance(spec, dict) or spec.get("format") != SPEC_FORMAT or "state_dict" not in content:
-        raise CheckpointError(f"{path} was not written by this version of hno: it lacks the entry {SPEC_KEY!r}.")
+    known = isinstance(spec, dict) and spec.get("format") == SPEC_FORMAT and spec.keys() >= _ENTRIES
+    if not known or "state_dict" not in content:
+        raise CheckpointError(f"{path} was not written by this version of hno: its entry {SPEC_KEY!r} is not complete.")
     return content
+
+
+_UNREADABLE = (
+    AttributeError, EOFError, LookupError, OSError, RuntimeError, TypeError, ValueError, pickle.UnpicklingError,
+    zipfile.BadZipFile,
+)  # fmt: skip
+"""What unpickling damaged or foreign bytes raises."""
+_ENTRIES = {"game", "constants", "fingerprint", "operator", "options", "seen_types"}
+"""Entries of a spec that loading needs."""
 
 
 def check_resumable(path: str | Path, operator: ValueOperator) -> None:

@@ -11,7 +11,7 @@ from torch import nn
 from torch.optim.lr_scheduler import CosineAnnealingLR
 
 from hno.operators.base import Optimizer
-from hno.registry import unknown_name
+from hno.registry import UnknownNameError, unknown_name
 
 OPTIMIZERS: dict[str, Callable[..., torch.optim.Optimizer]] = {
     "adam": torch.optim.Adam,
@@ -33,12 +33,12 @@ def make_optimizer(name: str, steps: int, lr: float, schedule: str, final_lr: fl
         options: further arguments of the optimiser.
 
     Raises:
-        KeyError: unknown optimiser or schedule.
+        UnknownNameError: unknown optimiser or schedule.
     """
     if name not in OPTIMIZERS:
-        raise KeyError(unknown_name("optimizer", name, sorted(OPTIMIZERS)))
+        raise UnknownNameError(unknown_name("optimizer", name, sorted(OPTIMIZERS)))
     if schedule not in SCHEDULES:
-        raise KeyError(unknown_name("schedule", schedule, list(SCHEDULES)))
+        raise UnknownNameError(unknown_name("schedule", schedule, list(SCHEDULES)))
 
     def build(parameters: Iterable[nn.Parameter]) -> dict[str, Any]:
         optimizer = OPTIMIZERS[name](parameters, lr=lr, **options)

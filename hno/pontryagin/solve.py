@@ -87,7 +87,9 @@ def _solve_chunk(game: Game, x0: Tensor, theta: Tensor, settings: Solver) -> Ext
         starts = find_starts(game, x0, theta, settings.search)
         size, kept = starts.cost.shape
         types = theta.repeat_interleave(kept, 0)
-        tried = starts.cost.flatten().isfinite()
+        tried = starts.cost.isfinite()
+        tried[:, 0] = True  # where no start is finite, one fails in Newton and carries the status
+        tried = tried.flatten()
         x, u = starts.x.flatten(0, 1)[tried], starts.u.flatten(0, 1)[tried]
         iterate, mesh = _initial_iterate(game, x, u, types[tried], settings.extra_nodes)
         z, residual, status = newton(Collocation(game), iterate, settings.newton)
@@ -122,7 +124,7 @@ def _encounter_weight(game: Game, labels: Tensor, x: Tensor, u: Tensor, theta: T
     inner = runge_kutta(game, x[:, :-1, None], u[:, :, None], (t - labels[:-1, None])[..., None, None])
     types = theta[:, None, None].expand(rows, steps, points + 1, -1)
     penalty = game.penalty(game.constraint(inner, types)).sum(-1)
-    weight = penalty.diff(dim=-1).abs().sum(-1).clamp_min(1e-12).sqrt()
+    weight = penalty.diff(dim=-1).abs().sum(-1).nan_to_num(0, 0).clamp_min(1e-12).sqrt()
     return weight / weight.amax(-1, keepdim=True) + 0.05
 
 

@@ -85,7 +85,7 @@ def _best_amplitude(problem: JointProblem, start: Tensor, shape: Tensor, amplitu
     tried = [(neutral + size * shape).clamp(-1, 1) for size in amplitudes]
     costs = torch.stack([problem.cost(problem.rollout(start, v), v) for v in tried])
     rows = torch.arange(len(start), device=start.device)
-    return torch.stack(tried)[costs.argmin(0), rows]
+    return torch.stack(tried)[costs.nan_to_num(torch.inf).argmin(0), rows]
 
 
 def _cheapest(x: Tensor, cost: Tensor, size: int, tolerance: float = 1e-2) -> tuple[Tensor, Tensor]:

@@ -28,6 +28,9 @@ class Encounter(ControlAffineGame):
     def drift(self, x: Tensor) -> Tensor:
         return double_integrator_drift(x)
 
+    def positions(self, x: Tensor) -> Tensor:
+        return x[..., :2]
+
     def terminal_value(self, x: Tensor) -> Tensor:
         return -x.square().sum(-1)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
@@ -11,7 +13,7 @@ NAMES = ("narrow_road", "lane_change", "drone")
 ENCOUNTERS = {
     "narrow_road": [[34.6, 4.5, 0.03, 21.0], [35.3, 3.2, -0.02, 19.0]],
     "lane_change": [[40.0, 3.0, 0.05, 20.0], [41.4, 5.3, -0.06, 22.0]],
-    "drone": [[2.2, 2.8, 0.3, 2.5, 3.0, 0.1], [2.5, 1.7, -0.2, 3.1, 2.2, -0.2]],
+    "drone": [[2.2, 2.8, 0.3, 2.5, 3.0, 0.1], [3.2, 1.5, -0.2, 3.1, 2.2, -0.2]],
 }
 
 
@@ -23,12 +25,9 @@ def encounters(name: str, size: int = 16) -> tuple[Game, Tensor, Tensor]:
     return game, base + jitter, game.type_box.sample(size, generator)
 
 
-def central_difference(function, point: Tensor, step: float = 1e-5) -> Tensor:
-    """d function / d point for a function of (..., P, n) with value (..., P), shape (..., P, P, n)."""
-    slopes = []
-    for j in range(point.shape[-2]):
-        for k in range(point.shape[-1]):
-            shift = torch.zeros_like(point)
-            shift[..., j, k] = step
-            slopes.append((function(point + shift) - function(point - shift)) / (2 * step))
-    return torch.stack(slopes, -1).unflatten(-1, point.shape[-2:])
+def central_difference(function: Callable[[Tensor], Tensor], point: Tensor, step: float = 1e-5) -> Tensor:
+    """d function / d point of a function of (..., B, P, n) with values (..., B, P), shape (B, P, P, n)."""
+    players, states = point.shape[-2:]
+    shifts = step * torch.eye(players * states, dtype=point.dtype).view(-1, *(1,) * (point.dim() - 2), players, states)
+    slopes = (function(point + shifts) - function(point - shifts)) / (2 * step)
+    return slopes.movedim(0, -1).unflatten(-1, (players, states))

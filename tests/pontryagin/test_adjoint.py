@@ -33,7 +33,7 @@ def test_the_penalty_acts_in_these_states(setting):
     penalty = game.penalty(game.constraint(x, theta))
     assert penalty.min() > 1
     assert penalty.max() < 9999
-    assert penalty.max() > 3 * penalty.min()
+    assert penalty.max() > 2 * penalty.min()
 
 
 @pytest.mark.parametrize("scale", [1.0, 100.0], ids=["free", "saturated"])
@@ -52,13 +52,14 @@ def test_the_state_moves_as_the_costate_derivative_of_the_hamiltonian(setting):
     costate = random_costate(x, 30.0)
     u = game.optimal_control(x, costate)
 
+    base = own_costate(costate)
+
     def hamiltonian(own: Tensor) -> Tensor:
-        changed = costate.clone()
-        changed.diagonal(dim1=-3, dim2=-2).copy_(own.mT)
+        changed = costate + torch.diag_embed((own - base).mT, dim1=-3, dim2=-2)
         return game.hamiltonian(x, changed, u, theta)
 
-    slope = own_costate(central_difference(hamiltonian, own_costate(costate), 1e-3))
-    torch.testing.assert_close(pmp_rate(game, x, own_costate(costate), theta)[0], slope, rtol=1e-6, atol=1e-6)
+    slope = own_costate(central_difference(hamiltonian, base, 1e-3))
+    torch.testing.assert_close(pmp_rate(game, x, base, theta)[0], slope, rtol=1e-6, atol=1e-6)
 
 
 def test_penalty_gradient_of_every_player_in_every_state(setting):

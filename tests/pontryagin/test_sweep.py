@@ -65,7 +65,7 @@ def test_costates_of_any_trajectory_are_the_gradient_of_the_value(name):
     """Own and cross costates, at controls that are not optimal."""
     game, x0, theta = encounters(name, size=3)
     u = game.control_box.sample(6, torch.Generator().manual_seed(2)).unflatten(0, (3, 2))
-    steps = 120
+    steps = 60
     x, value = play(game, x0, theta, u, steps)
     t = torch.linspace(0, 0.3, steps + 1, dtype=x.dtype).expand(3, -1)
     held = u.unsqueeze(1).expand(-1, steps + 1, -1, -1)

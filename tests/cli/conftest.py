@@ -1,0 +1,78 @@
+from __future__ import annotations
+
+import json
+import logging
+import os
+import sys
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+
+from hno.cli import evaluate, train
+
+SMOKE = ("experiment=smoke", "data.types=[[1,1]]", "data.workers=1")
+"""A run of seconds, on labels that every test shares."""
+
+
+class Outcome(NamedTuple):
+    """What a command left behind."""
+
+    code: int
+    """Exit code."""
+    text: str
+    """Everything it printed."""
+    folder: Path
+    """Its output folder."""
+
+    @property
+    def results(self) -> dict[str, Any]:
+        """Content of results.json; numbers that JSON does not know are refused."""
+
+        def refuse(constant: str) -> None:
+            raise AssertionError(f"results.json holds {constant}")
+
+        return json.loads((self.folder / "results.json").read_text(), parse_constant=refuse)
+
+
+Command = Callable[..., Outcome]
+
+
+@pytest.fixture
+def clean_globals() -> Iterator[None]:
+    """Undo what a command sets for its whole process: logging, warnings and environment."""
+    root, lightning = logging.getLogger(), logging.getLogger("lightning.pytorch")
+    saved = [(logger, logger.handlers[:], logger.level, logger.propagate) for logger in (root, lightning)]
+    format_warning, environment = warnings.formatwarning, dict(os.environ)
+    yield
+    logging.captureWarnings(False)
+    warnings.formatwarning = format_warning
+    for logger, handlers, level, propagate in saved:
+        logger.handlers[:], logger.level, logger.propagate = handlers, level, propagate
+    os.environ.clear()
+    os.environ.update(environment)
+
+
+@pytest.fixture
+def command(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path, clean_globals: None
+) -> Command:
+    """Run train.py or evaluate.py in this process, as the command line would."""
+    mains = {"train": train.main, "evaluate": evaluate.main}
+
+    def run(name: str, *overrides: str, folder: Path = tmp_path / "run") -> Outcome:
+        monkeypatch.setattr(sys, "argv", [f"{name}.py", f"hydra.run.dir={folder}", *overrides])
+        capsys.readouterr()
+        code: int | str | None = 0
+        try:
+            mains[name]()
+        except SystemExit as stop:
+            code = stop.code
+        printed = "".join(capsys.readouterr())
+        if isinstance(code, str):
+            code, printed = 1, printed + code
+        return Outcome(code or 0, printed, folder)
+
+    return run

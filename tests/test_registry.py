@@ -1,0 +1,161 @@
+"""Registries find classes late and once, and say what they know when asked for what they do not."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from importlib.metadata import EntryPoint
+
+import pytest
+
+from hno.registry import Registry, UnknownNameError
+
+PACKAGE = """
+from hno.registry import Registry
+
+animals = Registry("animal", "zoo_for_tests")
+"""
+MODULE = """
+from zoo_for_tests import animals
+
+
+@animals.register("zebra")
+class Zebra:
+    pass
+
+
+@animals.register("lion")
+class Lion:
+    pass
+"""
+PLUGIN = """
+class Axolotl:
+    pass
+
+
+class Lion:
+    pass
+"""
+NAMES = ("zoo_for_tests", "zoo_for_tests.savanna", "pond_for_tests")
+
+
+@pytest.fixture
+def installed(monkeypatch) -> list[EntryPoint]:
+    """Entry points that the metadata of installed packages would list; `queries` counts the look-ups."""
+    points: list[EntryPoint] = []
+    queries: list[str] = []
+
+    def entry_points(*, group: str) -> list[EntryPoint]:
+        queries.append(group)
+        return [point for point in points if point.group == group]
+
+    monkeypatch.setattr("hno.registry.entry_points", entry_points)
+    monkeypatch.setattr(sys.modules[__name__], "QUERIES", queries)
+    return points
+
+
+QUERIES: list[str] = []
+
+
+@pytest.fixture
+def animals(tmp_path, monkeypatch, installed) -> Registry[object]:
+    """A registry whose package has one module that nobody has imported yet."""
+    package = tmp_path / "zoo_for_tests"
+    package.mkdir()
+    (package / "__init__.py").write_text(PACKAGE, encoding="utf-8")
+    (package / "savanna.py").write_text(MODULE, encoding="utf-8")
+    (tmp_path / "pond_for_tests.py").write_text(PLUGIN, encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    for name in NAMES:
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    yield importlib.import_module("zoo_for_tests").animals
+    for name in NAMES:
+        sys.modules.pop(name, None)
+
+
+def plugin(name: str, target: str, group: str = "hno.animals") -> EntryPoint:
+    return EntryPoint(name, f"pond_for_tests:{target}", group)
+
+
+def test_modules_are_imported_on_the_first_look_up(animals):
+    assert "zoo_for_tests.savanna" not in sys.modules
+    assert animals.names() == ["lion", "zebra"]
+    assert animals.get("zebra") is sys.modules["zoo_for_tests.savanna"].Zebra
+
+
+def test_plugins_are_imported_on_the_first_look_up(animals, installed):
+    installed.append(plugin("axolotl", "Axolotl"))
+    installed.append(plugin("other", "Axolotl", group="hno.plants"))
+    assert "pond_for_tests" not in sys.modules
+    assert animals.get("axolotl").__name__ == "Axolotl"
+    assert animals.names() == ["axolotl", "lion", "zebra"]
+
+
+def test_discovery_happens_once(animals, installed):
+    assert QUERIES == []
+    animals.names()
+    installed.append(plugin("axolotl", "Axolotl"))
+    with pytest.raises(UnknownNameError):
+        animals.get("axolotl")
+    assert animals.names() == ["lion", "zebra"]
+    assert QUERIES == ["hno.animals"]
+
+
+def test_registering_does_not_discover(animals):
+    animals.register("gnu")(type("Gnu", (), {}))
+    assert QUERIES == []
+    assert "zoo_for_tests.savanna" not in sys.modules
+    assert animals.names() == ["gnu", "lion", "zebra"]
+
+
+def test_an_unknown_name_is_answered_with_all_and_the_nearest(animals):
+    with pytest.raises(UnknownNameError) as caught:
+        animals.get("zebar")
+    assert str(caught.value) == "No animal named 'zebar'. Known: lion, zebra. Did you mean 'zebra'?"
+
+
+def test_no_guess_is_made_for_a_name_unlike_any(animals):
+    with pytest.raises(UnknownNameError) as caught:
+        animals.get("xyz")
+    assert str(caught.value) == "No animal named 'xyz'. Known: lion, zebra."
+
+
+def test_an_unknown_name_is_a_key_error(animals):
+    with pytest.raises(KeyError):
+        animals.get("xyz")
+
+
+def test_a_taken_name_is_refused(animals):
+    animals.names()
+    with pytest.raises(ValueError, match=r"animal name 'lion' is taken by zoo_for_tests.savanna.Lion. Register .*Gnu"):
+        animals.register("lion")(type("Gnu", (), {}))
+    assert animals.get("lion").__name__ == "Lion"
+
+
+def test_a_plugin_may_not_take_a_known_name(animals, installed):
+    installed.append(plugin("lion", "Axolotl"))
+    with pytest.raises(ValueError, match=r"animal name 'lion' is taken by zoo_for_tests.savanna.Lion"):
+        animals.names()
+
+
+def test_registering_a_class_twice_is_harmless(animals):
+    lion = animals.get("lion")
+    assert animals.register("lion")(lion) is lion
+
+
+def test_classes_know_their_names(animals):
+    assert animals.name_of(animals.get("zebra")) == "zebra"
+    with pytest.raises(UnknownNameError, match=r"Gnu is not a registered animal. Known: lion, zebra"):
+        animals.name_of(type("Gnu", (), {}))
+
+
+@pytest.mark.parametrize(
+    ("module", "name", "known"),
+    [
+        ("hno.games", "games", {"drone", "lane_change", "narrow_road"}),
+        ("hno.losses", "losses", {"boundary", "costate", "residual", "value"}),
+        ("hno.operators", "operators", {"hno", "sno"}),
+    ],
+)
+def test_the_package_registers_what_it_ships(module, name, known):
+    assert known <= set(getattr(importlib.import_module(module), name).names())
