@@ -31,30 +31,30 @@ class Lion:
 PLUGIN = """
 class Axolotl:
     pass
-
-
-class Lion:
-    pass
 """
 NAMES = ("zoo_for_tests", "zoo_for_tests.savanna", "pond_for_tests")
 
 
+class Metadata:
+    """Entry points of installed packages, and how often they were asked for."""
+
+    def __init__(self) -> None:
+        self.points: list[EntryPoint] = []
+        self.queries: list[str] = []
+
+    def entry_points(self, *, group: str) -> list[EntryPoint]:
+        self.queries.append(group)
+        return [point for point in self.points if point.group == group]
+
+    def install(self, name: str, target: str, group: str = "hno.animals") -> None:
+        self.points.append(EntryPoint(name, f"pond_for_tests:{target}", group))
+
+
 @pytest.fixture
-def installed(monkeypatch) -> list[EntryPoint]:
-    """Entry points that the metadata of installed packages would list; `queries` counts the look-ups."""
-    points: list[EntryPoint] = []
-    queries: list[str] = []
-
-    def entry_points(*, group: str) -> list[EntryPoint]:
-        queries.append(group)
-        return [point for point in points if point.group == group]
-
-    monkeypatch.setattr("hno.registry.entry_points", entry_points)
-    monkeypatch.setattr(sys.modules[__name__], "QUERIES", queries)
-    return points
-
-
-QUERIES: list[str] = []
+def installed(monkeypatch) -> Metadata:
+    metadata = Metadata()
+    monkeypatch.setattr("hno.registry.entry_points", metadata.entry_points)
+    return metadata
 
 
 @pytest.fixture
@@ -73,10 +73,6 @@ def animals(tmp_path, monkeypatch, installed) -> Registry[object]:
         sys.modules.pop(name, None)
 
 
-def plugin(name: str, target: str, group: str = "hno.animals") -> EntryPoint:
-    return EntryPoint(name, f"pond_for_tests:{target}", group)
-
-
 def test_modules_are_imported_on_the_first_look_up(animals):
     assert "zoo_for_tests.savanna" not in sys.modules
     assert animals.names() == ["lion", "zebra"]
@@ -84,26 +80,26 @@ def test_modules_are_imported_on_the_first_look_up(animals):
 
 
 def test_plugins_are_imported_on_the_first_look_up(animals, installed):
-    installed.append(plugin("axolotl", "Axolotl"))
-    installed.append(plugin("other", "Axolotl", group="hno.plants"))
+    installed.install("axolotl", "Axolotl")
+    installed.install("other", "Axolotl", group="hno.plants")
     assert "pond_for_tests" not in sys.modules
     assert animals.get("axolotl").__name__ == "Axolotl"
     assert animals.names() == ["axolotl", "lion", "zebra"]
 
 
 def test_discovery_happens_once(animals, installed):
-    assert QUERIES == []
+    assert installed.queries == []
     animals.names()
-    installed.append(plugin("axolotl", "Axolotl"))
+    installed.install("axolotl", "Axolotl")
     with pytest.raises(UnknownNameError):
         animals.get("axolotl")
     assert animals.names() == ["lion", "zebra"]
-    assert QUERIES == ["hno.animals"]
+    assert installed.queries == ["hno.animals"]
 
 
-def test_registering_does_not_discover(animals):
+def test_registering_does_not_discover(animals, installed):
     animals.register("gnu")(type("Gnu", (), {}))
-    assert QUERIES == []
+    assert installed.queries == []
     assert "zoo_for_tests.savanna" not in sys.modules
     assert animals.names() == ["gnu", "lion", "zebra"]
 
@@ -133,7 +129,7 @@ def test_a_taken_name_is_refused(animals):
 
 
 def test_a_plugin_may_not_take_a_known_name(animals, installed):
-    installed.append(plugin("lion", "Axolotl"))
+    installed.install("lion", "Axolotl")
     with pytest.raises(ValueError, match=r"animal name 'lion' is taken by zoo_for_tests.savanna.Lion"):
         animals.names()
 
