@@ -2,8 +2,8 @@
 
     python benchmarks/evaluator.py [--game narrow_road] [--starts 200] [--repeats 3]
 
-The baseline evaluates one type after the other. The network is not trained: time does not depend on the weights. Solving
-the labels of the starts is not part of it; they are cached between evaluations.
+The baseline evaluates one type after the other. The network is not trained: time does not depend on the weights.
+Solving the labels of the starts is not part of it; they are cached between evaluations.
 """
 
 from __future__ import annotations
@@ -24,12 +24,14 @@ from hno.operators.checkpoint import OperatorPolicy
 
 
 def seconds(run: Callable[[], object]) -> float:
+    """Wall-clock time of one call."""
     began = time.perf_counter()
     run()
     return time.perf_counter() - began
 
 
 def main() -> None:
+    """Print the table and one JSON object."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--game", default="narrow_road")
     parser.add_argument("--starts", type=int, default=200)

@@ -114,7 +114,9 @@ class GameData(L.LightningDataModule):
         if interior_types not in ("labelled", "box"):
             raise ValueError(f"interior_types must be 'labelled' or 'box'; got {interior_types!r}.")
         if "bvp" not in streams and curriculum.start > 0:
-            raise ValueError("Nothing is trained before collocation begins: weigh a supervised term, or set pretrain to 0.")
+            raise ValueError(
+                "Nothing is trained before collocation begins: weigh a supervised term, or set pretrain to 0."
+            )
         for name, size in {"trajectories": trajectories, "validation": validation, **batch_sizes}.items():
             if size is not None and size < 1:
                 raise ValueError(f"The number of rows or trajectories {name!r} must be at least 1; got {size}.")

@@ -106,7 +106,9 @@ def _check_writable(folder: Path) -> None:
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
-        raise OSError(f"Labels cannot be written to {folder} ({error}). Choose another folder with $HNO_CACHE.") from error
+        raise OSError(
+            f"Labels cannot be written to {folder} ({error}). Choose another folder with $HNO_CACHE."
+        ) from error
 
 
 def label_path(game: Game, request: Request, cache: Path, settings: Solver) -> Path:
