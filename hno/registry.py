@@ -46,7 +46,7 @@ class Registry(Generic[T]):
 
         def decorate(cls: type[T]) -> type[T]:
             known = self._classes.get(name)
-            if known is not None and known.__qualname__ != cls.__qualname__:
+            if known is not None and (known.__module__, known.__qualname__) != (cls.__module__, cls.__qualname__):
                 raise ValueError(
                     f"The {self.kind} name {name!r} is taken by {known.__module__}.{known.__qualname__}. "
                     f"Register {cls.__module__}.{cls.__qualname__} under another name."
@@ -86,12 +86,12 @@ class Registry(Generic[T]):
     def _discover(self) -> None:
         if self._discovered:
             return
-        self._discovered = True
         package = importlib.import_module(self.package)
         for module in pkgutil.iter_modules(package.__path__):
             importlib.import_module(f"{self.package}.{module.name}")
         for point in entry_points(group=f"hno.{self.kind}s"):
             self.register(point.name)(point.load())
+        self._discovered = True
 
 
 def unknown_name(kind: str, name: str, known: list[str]) -> str:

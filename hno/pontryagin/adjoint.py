@@ -27,8 +27,7 @@ def penalty_gradient(game: Game, x: Tensor, theta: Tensor, *, create_graph: bool
         copies = per_player_copies(x)
         copies = copies if copies.requires_grad else copies.detach().requires_grad_()
         penalty = game.penalty(game.constraint(copies, theta.unsqueeze(-2).expand(copies.shape[:-1])))
-        total = penalty.diagonal(dim1=-2, dim2=-1).sum()
-        return torch.autograd.grad(total, copies, create_graph=create_graph)[0]
+        return gradient_of(penalty.diagonal(dim1=-2, dim2=-1).sum(), copies, create_graph=create_graph)
 
 
 def dynamics_jacobian(game: Game, x: Tensor, u: Tensor) -> Tensor:
@@ -38,9 +37,19 @@ def dynamics_jacobian(game: Game, x: Tensor, u: Tensor) -> Tensor:
         return jacobian_rows(game.dynamics(x, u.detach()), x).movedim(0, -2)
 
 
+def gradient_of(output: Tensor, point: Tensor, weight: Tensor | None = None, *, create_graph: bool = False) -> Tensor:
+    """Gradient of a scalar, or of a weighted sum; zero if nothing depends on the point. The graph is kept."""
+    if not output.requires_grad:
+        return torch.zeros_like(point)
+    options = {"create_graph": create_graph, "retain_graph": True, "materialize_grads": True}
+    return torch.autograd.grad(output, point, weight, **options)[0]
+
+
 def jacobian_rows(output: Tensor, point: Tensor) -> Tensor:
     """Gradient of each last-axis entry of `output`, summed over its other axes, (k, *point)."""
     size = output.shape[-1]
+    if not output.requires_grad:
+        return torch.zeros(size, *point.shape, dtype=point.dtype, device=point.device)
     basis = torch.eye(size, dtype=output.dtype, device=output.device)
     seeds = basis.view(size, *(1,) * (output.dim() - 1), size).expand(size, *output.shape)
     return torch.autograd.grad(output, point, seeds, is_grads_batched=True, materialize_grads=True)[0]
@@ -52,7 +61,7 @@ def terminal_costate(game: Game, x: Tensor, *, create_graph: bool = False) -> Te
         copies = per_player_copies(x)
         copies = copies if copies.requires_grad else copies.detach().requires_grad_()
         total = game.terminal_value(copies).diagonal(dim1=-2, dim2=-1).sum()
-        return torch.autograd.grad(total, copies, create_graph=create_graph)[0]
+        return gradient_of(total, copies, create_graph=create_graph)
 
 
 def drift_rate(game: Game, x: Tensor, own: Tensor, *, create_graph: bool = False) -> tuple[Tensor, Tensor]:
@@ -66,7 +75,7 @@ def drift_rate(game: Game, x: Tensor, own: Tensor, *, create_graph: bool = False
         u = game.best_response(x, own)
         held = x.view_as(x)  # differentiating in this alias leaves the control's dependence on x out
         flow = game.dynamics(held, u)
-        transport = torch.autograd.grad(flow, held, own, create_graph=create_graph, retain_graph=True)[0]
+        transport = gradient_of(flow, held, own, create_graph=create_graph)
     return flow, -transport
 
 

@@ -28,7 +28,9 @@ class Newton(NamedTuple):
     steps: int = 40
     """Step budget."""
     halvings: int = 8
-    """Step-length halvings before a trajectory counts as stalled."""
+    """Step-length halvings before the search counts as stalled."""
+    full_steps: int = 25
+    """Budget of undamped steps for a stalled trajectory, from each of two origins."""
 
 
 class Iterate(NamedTuple):
@@ -156,11 +158,40 @@ def _apply(matrix: Tensor, offset: Tensor, vector: Tensor) -> Tensor:
 
 
 def newton(equations: Collocation, start: Iterate, settings: Newton) -> tuple[Tensor, Tensor, Tensor]:
-    """Damped Newton, stopping each trajectory on its own.
+    """Damped Newton, then full steps for what stalled; every trajectory stops on its own.
+
+    Where controls reach their bounds the equations have kinks. There a residual that must fall at every step stops the
+    search, but full steps carry it through: first from where it stalled, then from the start.
 
     Returns:
         The unknowns (B, K, D), their scaled residual (B,) and `Status` (B,).
     """
+    z, residual, status = _damped_steps(equations, start, settings)
+    for origin in (z.clone(), start.z):
+        rows = (status == Status.STALLED).nonzero().squeeze(-1)
+        if len(rows) == 0:
+            break
+        reached, size = _full_steps(equations, Iterate(start.t[rows], origin[rows], start.theta[rows]), settings)
+        done = size <= settings.tolerance
+        z[rows[done]], residual[rows[done]], status[rows[done]] = reached[done], size[done], Status.CONVERGED
+    return z, residual, status
+
+
+def _full_steps(equations: Collocation, at: Iterate, settings: Newton) -> tuple[Tensor, Tensor]:
+    """Unknowns and residuals of undamped Newton, when converged or after the last step."""
+    z, residual = at.z.clone(), torch.full_like(at.z[:, 0, 0], torch.inf)
+    for _ in range(settings.full_steps):
+        active = (residual > settings.tolerance).nonzero().squeeze(-1)
+        if len(active) == 0:
+            break
+        part = Iterate(at.t[active], z[active], at.theta[active])
+        z[active] += equations.step(part).nan_to_num(0, 0, 0)
+        residual[active] = equations.residual(part._replace(z=z[active]))
+    return z, residual
+
+
+def _damped_steps(equations: Collocation, start: Iterate, settings: Newton) -> tuple[Tensor, Tensor, Tensor]:
+    """Newton with a line search: unknowns, residuals and `Status`."""
     z, residual = start.z.clone(), equations.residual(start)
     status = torch.full_like(residual, Status.MAX_STEPS, dtype=torch.int64)
     for _ in range(settings.steps):

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from hno.games import Game
-from hno.pontryagin.adjoint import jacobian_rows
+from hno.pontryagin.adjoint import gradient_of, jacobian_rows
 from hno.pontryagin.integrate import runge_kutta
 
 BLOCK = 64
@@ -125,7 +125,7 @@ class JointProblem:
             inner = torch.lerp(start, end, share.to(x)).detach().requires_grad_()
             theta = self.theta[:, None, None].expand(inner.shape[:-1])
             worst = self.game.constraint(inner, theta).amax(-1) + self.margin
-            slope = torch.autograd.grad(worst.sum(), inner)[0]
+            slope = gradient_of(worst.sum(), inner)
         through = torch.einsum("rkqpn,rkpnj->rkqpj", slope, sensitivity) * share
         at_start, at_control = through.split([x.shape[-1], sensitivity.shape[-1] - x.shape[-1]], -1)
         row = torch.cat([((1 - share) * slope + at_start).flatten(-2), at_control.flatten(-2)], -1)
@@ -140,18 +140,18 @@ class JointProblem:
         with torch.enable_grad():
             v = v.detach().requires_grad_()
             total = self.dt * self.game.effort(self.control(v)).sum()
-            gradient = torch.autograd.grad(total, v, create_graph=True)[0]
-            hessian = jacobian_rows(gradient, v).movedim(0, -2)
-        return gradient.detach().flatten(-2), _block_diagonal(hessian)
+            slope = gradient_of(total, v, create_graph=True)
+            hessian = jacobian_rows(slope, v).movedim(0, -2)
+        return slope.detach().flatten(-2), _block_diagonal(hessian)
 
     def _end_expansion(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Gradient (R, D) and Hessian (R, D, D) of the terminal cost."""
         with torch.enable_grad():
             flat = x.flatten(-2).detach().requires_grad_()
             total = -self.game.terminal_value(flat.unflatten(-1, x.shape[-2:])).sum()
-            gradient = torch.autograd.grad(total, flat, create_graph=True)[0]
-            hessian = jacobian_rows(gradient, flat).movedim(0, -2)
-        return gradient.detach(), hessian
+            slope = gradient_of(total, flat, create_graph=True)
+            hessian = jacobian_rows(slope, flat).movedim(0, -2)
+        return slope.detach(), hessian
 
 
 def _block_diagonal(blocks: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""States of the games of the paper in which the penalty acts."""
+"""Start states, states in which the penalty acts, and derivatives by finite differences."""
 
 from __future__ import annotations
 
@@ -31,3 +31,13 @@ def central_difference(function: Callable[[Tensor], Tensor], point: Tensor, step
     shifts = step * torch.eye(players * states, dtype=point.dtype).view(-1, *(1,) * (point.dim() - 2), players, states)
     slopes = (function(point + shifts) - function(point - shifts)) / (2 * step)
     return slopes.movedim(0, -1).unflatten(-1, (players, states))
+
+
+def starts(game: Game, size: int, seed: int = 0) -> Tensor:
+    """Random initial states, float64, (size, P, n)."""
+    return game.initial_box.sample(size, torch.Generator().manual_seed(seed)).double()
+
+
+def types(size: int, *theta: float) -> Tensor:
+    """The same types for every row, (size, P)."""
+    return torch.tensor([theta], dtype=torch.float64).expand(size, -1)

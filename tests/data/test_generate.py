@@ -1,0 +1,172 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from hno.data import generate
+from hno.data.generate import Request, default_cache, label_path, labels_for, start_states
+from hno.data.store import LabelFileError
+from hno.games import Game, make
+from hno.pontryagin.solve import Solver
+from hno.types import Extremal, Status
+from tests.conftest import TRAIN
+from tests.fakes import fake_labels
+
+REQUEST = Request((1.0, 5.0), 6, 0, "train")
+
+
+@pytest.mark.parametrize("name", ["narrow_road", "lane_change", "drone"])
+def test_start_states_lie_in_the_start_box(name: str) -> None:
+    game = make(name)
+    states = start_states(game, REQUEST._replace(starts=200))
+    assert states.dtype == torch.float64
+    assert bool(game.initial_box.contains(states).all())
+    assert float(game.initial_box.scale(states).abs().amax((0, 1, 2))) > 0.95
+
+
+def test_start_states_are_a_function_of_the_request() -> None:
+    game = make("narrow_road")
+    states = start_states(game, REQUEST)
+    torch.manual_seed(5)
+    assert torch.equal(start_states(make("narrow_road"), REQUEST), states)
+
+
+@pytest.mark.parametrize("change", [{"split": "test"}, {"seed": 1}, {"theta": (5.0, 1.0)}])
+def test_different_requests_share_no_start_state(change: dict[str, object]) -> None:
+    game = make("narrow_road")
+    ours = start_states(game, REQUEST._replace(starts=50)).flatten(1)
+    theirs = start_states(game, REQUEST._replace(starts=50)._replace(**change)).flatten(1)
+    assert not bool((ours.unsqueeze(1) == theirs).any())
+
+
+def test_more_starts_begin_with_the_fewer() -> None:
+    game = make("narrow_road")
+    assert torch.equal(start_states(game, REQUEST._replace(starts=9))[:6], start_states(game, REQUEST))
+
+
+def test_widened_start_box() -> None:
+    game = make("narrow_road")
+    wide = start_states(game, REQUEST._replace(starts=300, widen=2.0))
+    assert bool(game.initial_box.widened(2.0).contains(wide).all())
+    assert not bool(game.initial_box.contains(wide).all())
+
+
+def test_key_is_the_same_for_the_same_content(tmp_path: Path) -> None:
+    first = label_path(make("narrow_road"), REQUEST, tmp_path, Solver())
+    assert label_path(make("narrow_road"), REQUEST, tmp_path, Solver()) == first
+    assert label_path(make("narrow_road", radius=1.25), REQUEST, tmp_path, Solver()) == first
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"game": make("narrow_road", radius=1.3)},
+        {"game": make("narrow_road", speed=17.0)},
+        {"game": make("narrow_road", horizon=2.0)},
+        {"game": make("lane_change")},
+        {"request": REQUEST._replace(theta=(5.0, 1.0))},
+        {"request": REQUEST._replace(theta=(1.0000001, 5.0))},
+        {"request": REQUEST._replace(starts=7)},
+        {"request": REQUEST._replace(seed=1)},
+        {"request": REQUEST._replace(split="test")},
+        {"request": REQUEST._replace(widen=2.0)},
+        {"settings": Solver(extra_nodes=61)},
+        {"settings": Solver(newton=Solver().newton._replace(tolerance=1e-7))},
+        {"settings": Solver(search=Solver().search._replace(margin=0.5))},
+    ],
+    ids=lambda change: str(next(iter(change.items())))[:60],
+)
+def test_key_changes_with_whatever_determines_labels(tmp_path: Path, change: dict[str, object]) -> None:
+    same = {"game": make("narrow_road"), "request": REQUEST, "cache": tmp_path, "settings": Solver()}
+    assert label_path(**(same | change)) != label_path(**same)
+
+
+def test_key_changes_with_the_version_of_the_solver(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = label_path(make("narrow_road"), REQUEST, tmp_path, Solver())
+    monkeypatch.setattr(generate, "SOLVER_VERSION", generate.SOLVER_VERSION + 1)
+    assert label_path(make("narrow_road"), REQUEST, tmp_path, Solver()) != before
+
+
+def test_cache_folder_comes_from_the_environment(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("HNO_CACHE", str(tmp_path))
+    assert default_cache() == tmp_path
+    monkeypatch.delenv("HNO_CACHE")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "user"))
+    assert default_cache() == tmp_path / "user" / "hno"
+
+
+Solve = Callable[[Game, Tensor, Tensor, Solver], Extremal]
+
+
+@pytest.fixture
+def calls(monkeypatch: pytest.MonkeyPatch) -> list[tuple[float, ...]]:
+    """The types that were asked of a solver that answers at once; it fails for theta = (9, 9)."""
+    asked: list[tuple[float, ...]] = []
+
+    def answer(game: Game, x0: Tensor, theta: Tensor, settings: Solver) -> Extremal:
+        asked.append(tuple(theta[0].tolist()))
+        if asked[-1] == (9.0, 9.0):
+            raise RuntimeError("power cut")
+        return fake_labels(game, theta[0].tolist(), len(x0), start=x0)
+
+    monkeypatch.setattr(generate, "solve", answer)
+    return asked
+
+
+def test_solved_labels_are_read_and_not_solved_again(tmp_path: Path, calls: list[tuple[float, ...]]) -> None:
+    game, requests = make("narrow_road"), [REQUEST, REQUEST._replace(theta=(2.0, 2.0))]
+    first, _ = labels_for(game, requests[:1], tmp_path, workers=1)
+    both, _ = labels_for(game, requests, tmp_path, workers=1)
+    assert calls == [(1.0, 5.0), (2.0, 2.0)]
+    assert all(map(torch.equal, first[0], both[0]))
+    assert torch.equal(both[1].theta[0], torch.tensor([2.0, 2.0], dtype=torch.float64))
+
+
+def test_an_interrupted_generation_keeps_what_is_complete(tmp_path: Path, calls: list[tuple[float, ...]]) -> None:
+    game, requests = make("narrow_road"), [REQUEST, REQUEST._replace(theta=(9.0, 9.0))]
+    with pytest.raises(RuntimeError, match="power cut"):
+        labels_for(game, requests, tmp_path, workers=1)
+    assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == [
+        label_path(game, REQUEST, tmp_path, Solver()).name
+    ]
+
+
+def test_chunks_are_joined_in_the_order_of_the_starts(tmp_path: Path, calls: list[tuple[float, ...]]) -> None:
+    game, counted = make("narrow_road"), []
+    settings = Solver(chunk=4)
+    found, _ = labels_for(game, [REQUEST], tmp_path, settings, 1, lambda done, total: counted.append((done, total)))
+    assert torch.equal(found[0].x[:, 0], start_states(game, REQUEST))
+    assert counted == [(4, 6), (6, 6)]
+
+
+def test_unwritable_folder_is_refused_before_solving(calls: list[tuple[float, ...]]) -> None:
+    with pytest.raises(OSError, match=r"/proc/labels.*\$HNO_CACHE"):
+        labels_for(make("narrow_road"), [REQUEST], Path("/proc/labels"), workers=1)
+    assert not calls
+
+
+def test_damaged_file_is_named_and_kept_before_solving(tmp_path: Path, calls: list[tuple[float, ...]]) -> None:
+    game = make("narrow_road")
+    labels_for(game, [REQUEST], tmp_path, workers=1)
+    path = label_path(game, REQUEST, tmp_path, Solver())
+    path.write_bytes(path.read_bytes()[:-5])
+    calls.clear()
+    with pytest.raises(LabelFileError, match=path.name):
+        labels_for(game, [REQUEST._replace(theta=(2.0, 2.0)), REQUEST], tmp_path, workers=1)
+    assert not calls
+
+
+def test_serial_and_parallel_labels_are_equal_bit_for_bit(tmp_path: Path) -> None:
+    game, settings = make("narrow_road"), Solver(chunk=2)
+    serial, parallel = (labels_for(game, [TRAIN], tmp_path / str(n), settings, n)[0][0] for n in (1, 2))
+    assert bool((serial.status == Status.CONVERGED).all())
+    assert all(one.numpy().tobytes() == two.numpy().tobytes() for one, two in zip(serial, parallel, strict=True))
+
+
+def test_labels_start_where_they_were_asked(labels: Callable[..., Extremal]) -> None:
+    found = labels("narrow_road")
+    torch.testing.assert_close(found.x[:, 0], start_states(make("narrow_road"), TRAIN), rtol=0, atol=1e-9)

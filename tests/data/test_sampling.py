@@ -1,0 +1,132 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from hno.data.curriculum import Curriculum
+from hno.data.sampling import check_shares, onto_band
+from hno.games import Game, make
+from tests.data.conftest import TYPES, MakeData
+
+GAMES = ("narrow_road", "lane_change", "drone")
+BASE = {"narrow_road": 1.25, "lane_change": 2.25, "drone": 0.5}
+ONLY = {name: {"box": 0.0, "band": 0.0, "labels": 0.0, name: 1.0} for name in ("box", "band", "labels")}
+
+
+def radius(game: str, theta: Tensor) -> Tensor:
+    """Collision radius as the paper states it, (B,)."""
+    return BASE[game] + 0.1 * (theta[:, 0] + theta[:, 1]) + 0.05 * torch.minimum(theta[:, 0], theta[:, 1])
+
+
+def distance(game: str, x: Tensor) -> Tensor:
+    """Distance of the two players as the paper states it, (B,)."""
+    first, second = x[:, 0], x[:, 1]
+    if game == "drone":
+        gaps = [5 - second[:, 0] - first[:, 0], 5 - second[:, 1] - first[:, 1], second[:, 2] - first[:, 2]]
+    else:
+        along = 70 - second[:, 0] - first[:, 0] if game == "narrow_road" else second[:, 0] - first[:, 0]
+        gaps = [along, second[:, 1] - first[:, 1]]
+    return torch.stack(gaps, -1).norm(dim=-1)
+
+
+@pytest.mark.parametrize("name", GAMES)
+@pytest.mark.parametrize("stream", ["bvp", "interior", "terminal"])
+@pytest.mark.parametrize("types", ["labelled", "box"])
+def test_collision_radius_of_a_row_is_that_of_its_own_theta(
+    make_data: MakeData, name: str, stream: str, types: str
+) -> None:
+    """Published defect 1: a slicing slip took the radius of other rows."""
+    game = make(name)
+    points = make_data(game, interior_types=types).batch(9)[stream].points
+    assert len(points.theta.unique(dim=0)) > 2
+    own = game.constraint(points.x, points.theta) + distance(name, points.x).unsqueeze(-1)
+    torch.testing.assert_close(own, radius(name, points.theta).unsqueeze(-1).expand(-1, 2), rtol=0, atol=2e-4)
+
+
+@pytest.mark.parametrize("name", GAMES)
+def test_band_lies_at_the_surface_of_the_theta_of_each_row(make_data: MakeData, name: str) -> None:
+    game, sizes = make(name), {"bvp": 1, "interior": 2000, "terminal": 1}
+    near = {}
+    for source in ("box", "band"):
+        points = make_data(game, shares=ONLY[source], batch_sizes=sizes).batch(9)["interior"].points
+        gap = radius(name, points.theta) - distance(name, points.x)
+        near[source] = float(((gap > -1.6) & (gap < 0.4)).float().mean())
+    assert near["band"] > 0.9
+    assert near["box"] < 0.3
+
+
+def test_band_spreads_over_its_width(make_data: MakeData) -> None:
+    game, sizes = make("narrow_road"), {"bvp": 1, "interior": 2000, "terminal": 1}
+    points = make_data(game, shares=ONLY["band"], batch_sizes=sizes).batch(9)["interior"].points
+    gap = game.constraint(points.x, points.theta).amax(-1)
+    assert float((gap < -1).float().mean()) > 0.1
+    assert float((gap > 0).float().mean()) > 0.05
+
+
+def test_onto_band_reaches_its_target() -> None:
+    game, generator = make("lane_change"), torch.Generator().manual_seed(0)
+    x, theta = game.state_box.sample(500, generator), game.type_box.sample(500, generator)
+    target = torch.linspace(-1.5, 0.3, 500)
+    gap = game.constraint(onto_band(game, x, theta, target), theta).amax(-1) - target
+    assert float(gap.abs().median()) < 1e-3
+
+
+@pytest.mark.parametrize("name", GAMES)
+@pytest.mark.parametrize("source", ["box", "band", "labels"])
+def test_points_stay_in_the_state_box(make_data: MakeData, name: str, source: str) -> None:
+    game = make(name)
+    batch = make_data(game, shares=ONLY[source]).batch(5)
+    for stream in ("interior", "terminal"):
+        assert bool(game.state_box.contains(batch[stream].points.x).all())
+
+
+@pytest.mark.parametrize("source", ["box", "band", "labels"])
+@pytest.mark.parametrize("step", [0, 3, 9, 50])
+def test_interior_times_stay_in_the_window_and_fill_it(make_data: MakeData, source: str, step: int) -> None:
+    data = make_data(shares=ONLY[source], curriculum=Curriculum(0, 10))
+    tau = data.batch(step)["interior"].points.tau
+    reach = min(1.0, (step + 1) / 10) * data.game.horizon
+    assert float(tau.min()) >= 0
+    assert float(tau.max()) <= reach * (1 + 1e-6)
+    assert float(tau.max()) > 0.8 * reach
+    assert float(tau.min()) < 0.2 * reach
+
+
+def test_terminal_points_are_at_the_end(make_data: MakeData) -> None:
+    assert not make_data().batch(9)["terminal"].points.tau.any()
+
+
+def test_labels_source_stays_near_labelled_states_of_that_time(make_data: MakeData) -> None:
+    data = make_data(shares=ONLY["labels"])
+    points, rows, width = data.batch(4)["interior"].points, data.train_rows.points, data.game.state_box.width
+    for tau, x in zip(points.tau, points.x, strict=True):
+        states = rows.x[rows.tau == tau]
+        assert len(states)
+        assert float(((states - x) / width).abs().amax((-2, -1)).min()) < 0.05 * 5
+
+
+def types_of(game: Game, make_data: MakeData, source: str) -> Tensor:
+    sizes = {"bvp": 1, "interior": 500, "terminal": 1}
+    return make_data(game, interior_types=source, batch_sizes=sizes).batch(9)["interior"].points.theta
+
+
+def test_types_of_collocation_points(make_data: MakeData) -> None:
+    game = make("narrow_road")
+    labelled, box = types_of(game, make_data, "labelled"), types_of(game, make_data, "box")
+    assert {tuple(theta) for theta in labelled.tolist()} == set(TYPES)
+    assert bool(game.type_box.contains(box).all())
+    assert len(box.unique(dim=0)) == 500
+    assert float(box.min()) < 1.1
+    assert float(box.max()) > 4.9
+
+
+@pytest.mark.parametrize(
+    "shares",
+    [{"box": -0.1, "band": 1.0}, {"box": 0.0}, {"sphere": 1.0}, {"box": math.nan}, {"box": math.inf, "band": 1.0}, {}],
+)
+def test_impossible_shares_are_refused(shares: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match="box, band, labels"):
+        check_shares(shares)

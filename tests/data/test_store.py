@@ -1,0 +1,155 @@
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import safetensors
+import safetensors.torch
+import torch
+
+from hno.data import store
+from hno.data.store import LabelFileError, canonical_json, read_labels, write_labels
+from hno.games import make
+from hno.types import Extremal
+from tests.fakes import fake_labels
+
+PROVENANCE = {"game": "NarrowRoad", "request": {"theta": [1.0, 1.0], "count": 4}}
+
+
+@pytest.fixture
+def labels() -> Extremal:
+    found = fake_labels(make("narrow_road"))
+    found.alternatives[0, 1] = torch.nan
+    return found
+
+
+@pytest.fixture
+def written(tmp_path: Path, labels: Extremal) -> Path:
+    path = tmp_path / "some" / "folder" / "labels.safetensors"
+    write_labels(path, labels, PROVENANCE)
+    return path
+
+
+def bits(labels: Extremal) -> dict[str, tuple[str, tuple[int, ...], bytes]]:
+    return {name: (str(t.dtype), tuple(t.shape), t.numpy().tobytes()) for name, t in labels._asdict().items()}
+
+
+def test_round_trip_is_bit_exact(written: Path, labels: Extremal) -> None:
+    read, provenance = read_labels(written)
+    assert bits(read) == bits(labels)
+    assert provenance == PROVENANCE
+
+
+def test_only_the_label_file_is_left(written: Path) -> None:
+    assert list(written.parent.iterdir()) == [written]
+
+
+def test_metadata_is_one_canonical_json_key(written: Path) -> None:
+    with safetensors.safe_open(written, framework="pt") as file:
+        metadata = file.metadata()
+    assert list(metadata) == ["hno"]
+    assert metadata["hno"] == canonical_json(json.loads(metadata["hno"]))
+
+
+def test_canonical_json_ignores_the_order_of_keys_and_refuses_nan() -> None:
+    assert canonical_json({"b": 1, "a": [2, {"d": 3, "c": 4}]}) == canonical_json({"a": [2, {"c": 4, "d": 3}], "b": 1})
+    with pytest.raises(ValueError, match="JSON"):
+        canonical_json({"a": float("nan")})
+
+
+def refused(path: Path) -> str:
+    """The message with which a file is refused; the file stays as it is."""
+    before = path.read_bytes()
+    with pytest.raises(LabelFileError) as error:
+        read_labels(path)
+    assert path.read_bytes() == before
+    message = str(error.value)
+    assert str(path) in message
+    assert "Move it away and run again" in message
+    return message
+
+
+@pytest.mark.parametrize("kept", [0, 4, 100, 0.5, 0.999])
+def test_truncated_file_is_refused(written: Path, kept: float) -> None:
+    content = written.read_bytes()
+    written.write_bytes(content[: int(kept * len(content)) if kept < 1 else int(kept)])
+    refused(written)
+
+
+def test_a_flipped_bit_anywhere_in_the_tensors_is_refused(written: Path) -> None:
+    content = written.read_bytes()
+    header = 8 + int.from_bytes(content[:8], "little")
+    for place in range(header, len(content), (len(content) - header) // 40):
+        flipped = bytearray(content)
+        flipped[place] ^= 1
+        written.write_bytes(flipped)
+        assert "checksum" in refused(written)
+
+
+def test_a_flipped_bit_in_the_header_never_changes_a_label(written: Path, labels: Extremal) -> None:
+    content = written.read_bytes()
+    for place in range(0, 8 + int.from_bytes(content[:8], "little"), 7):
+        flipped = bytearray(content)
+        flipped[place] ^= 4
+        written.write_bytes(flipped)
+        try:
+            assert bits(read_labels(written)[0]) == bits(labels)
+        except LabelFileError:
+            continue
+
+
+def test_foreign_safetensors_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "weights.safetensors"
+    safetensors.torch.save_file({"weight": torch.zeros(3)}, path)
+    assert "without hno's metadata" in refused(path)
+    safetensors.torch.save_file({"weight": torch.zeros(3)}, path, metadata={"hno": "[1, 2"})
+    assert "without hno's metadata" in refused(path)
+
+
+def test_other_files_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "labels.safetensors"
+    path.write_text("these are no labels")
+    refused(path)
+
+
+def test_other_format_is_refused(written: Path, labels: Extremal, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(store, "FORMAT", 99)
+        write_labels(written, labels, PROVENANCE)
+    assert "format 99, expected 1" in refused(written)
+
+
+def half_a_file(tensors: object, path: str, metadata: object = None) -> None:
+    Path(path).write_bytes(b"half a file")
+    raise OSError(28, "No space left on device")
+
+
+def no_rename(source: object, target: object) -> None:
+    raise OSError(30, "Read-only file system")
+
+
+def interrupted(tensors: object, path: str, metadata: object = None) -> None:
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize(
+    ("target", "name", "failure"),
+    [
+        (safetensors.torch, "save_file", half_a_file),
+        (os, "replace", no_rename),
+        (safetensors.torch, "save_file", interrupted),
+    ],
+    ids=["disk full", "no rename", "interrupted"],
+)
+def test_existing_file_survives_a_failed_write(
+    written: Path, monkeypatch: pytest.MonkeyPatch, target: object, name: str, failure: Callable[..., None]
+) -> None:
+    before = written.read_bytes()
+    monkeypatch.setattr(target, name, failure)
+    with pytest.raises((OSError, KeyboardInterrupt)):
+        write_labels(written, fake_labels(make("narrow_road"), seed=1), PROVENANCE)
+    assert written.read_bytes() == before
+    assert list(written.parent.iterdir()) == [written]

@@ -1,0 +1,56 @@
+"""Labels that were not solved, for tests that need many types, failures or chosen clearances."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from hno.games import Game
+from hno.pontryagin.mesh import label_times
+from hno.types import Extremal, Status
+
+
+def fake_labels(
+    game: Game,
+    theta: Sequence[float] = (1.0, 1.0),
+    count: int = 4,
+    seed: int = 0,
+    status: Sequence[Status] | None = None,
+    clearance: Sequence[float] | None = None,
+    start: Tensor | None = None,
+) -> Extremal:
+    """Random states of the PDE box with random values and costates, on the label grid of a game.
+
+    Args:
+        game: the game.
+        theta: type of all rows.
+        count: number of rows.
+        seed: of everything random.
+        status: of each row; converged by default.
+        clearance: of each row, m; 1 by default.
+        start: first state of each row, (count, P, n).
+    """
+    generator = torch.Generator().manual_seed(seed)
+    t = label_times(game, dtype=torch.float64, device=torch.device("cpu"))
+    nodes, players, states = len(t), game.players, game.state_dim
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(shape, generator=generator, dtype=torch.float64)
+
+    x = game.state_box.sample(count * nodes, generator).double().unflatten(0, (count, nodes))
+    if start is not None:
+        x[:, 0] = start
+    return Extremal(
+        status=torch.tensor([int(s) for s in status or [Status.CONVERGED] * count]),
+        residual=normal(count).abs(),
+        t=t,
+        x=x,
+        costate=normal(count, nodes, players, players, states),
+        u=normal(count, nodes, players, game.control_dim),
+        value=-normal(count, nodes, players).abs(),
+        theta=torch.tensor(theta, dtype=torch.float64).expand(count, -1).contiguous(),
+        clearance=torch.tensor(clearance or [1.0] * count, dtype=torch.float64),
+        alternatives=normal(count, 3),
+    )
