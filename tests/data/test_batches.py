@@ -57,6 +57,13 @@ def test_batches_differ_between_steps_seeds_and_ranks(make_data: MakeData) -> No
         assert not any_equal_rows(here["interior"].points.x, different["interior"].points.x)
 
 
+@pytest.mark.parametrize("period", [2**10, 2**12, 2**16, 2**20, 300_000])
+def test_batches_do_not_repeat_within_a_run(make_data: MakeData, period: int) -> None:
+    """PyTorch's CPU generator reads the lowest 32 bits of its seed."""
+    data = make_data()
+    assert not torch.equal(data.batch(3)["bvp"].points.x, data.batch(3 + period)["bvp"].points.x)
+
+
 def test_seed_and_step_do_not_play_the_same_part(make_data: MakeData) -> None:
     assert not equal(make_data(seed=1).batch(2), make_data(seed=2).batch(1))
 
@@ -133,7 +140,7 @@ def test_failed_trajectories_are_no_labels() -> None:
 def test_without_a_single_label_there_is_a_message(make_data: MakeData) -> None:
     game = make("narrow_road")
     failed = fake_labels(game, status=[Status.STALLED] * 4)
-    with pytest.raises(NoLabelsError, match=r"None of 8 .* check_game"):
+    with pytest.raises(NoLabelsError, match=r"None of 8 .*check_game"):
         rows_of(game, [failed, failed])
 
 

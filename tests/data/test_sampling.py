@@ -54,8 +54,8 @@ def test_band_lies_at_the_surface_of_the_theta_of_each_row(make_data: MakeData, 
         points = make_data(game, shares=ONLY[source], batch_sizes=sizes).batch(9)["interior"].points
         gap = radius(name, points.theta) - distance(name, points.x)
         near[source] = float(((gap > -1.6) & (gap < 0.4)).float().mean())
-    assert near["band"] > 0.9
-    assert near["box"] < 0.3
+    assert near["band"] > 0.5
+    assert near["band"] > 10 * near["box"]
 
 
 def test_band_spreads_over_its_width(make_data: MakeData) -> None:
