@@ -81,10 +81,10 @@ def load_operator(path: str | Path, game: str | None = None) -> ValueOperator:
     built = make(spec["game"], **spec["constants"])
     if built.fingerprint() != spec["fingerprint"]:
         raise CheckpointError(f"{path} was trained on another version of the game {spec['game']!r}. Train it again.")
-    operator = operators.get(spec["operator"])(built, **spec["options"])
     try:
+        operator = operators.get(spec["operator"])(built, **spec["options"])
         operator.load_state_dict(content["state_dict"])
-    except RuntimeError as error:
+    except (RuntimeError, TypeError) as error:
         raise CheckpointError(f"{path} does not hold the weights that its own entry {SPEC_KEY!r} describes.") from error
     operator.seen_types = [tuple(theta) for theta in spec["seen_types"]]
     return operator.eval().requires_grad_(False)
@@ -106,8 +106,20 @@ class OperatorPolicy:
         return self.operator.game
 
     def __call__(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
-        """Controls in physical units, (B,), (B, P, n), (B, P) -> (B, P, m)."""
-        return self.game.optimal_control(x, self.operator.field(Points(tau, x, theta)).costate)
+        """Controls in physical units, (B,), (B, P, n), (B, P) -> (B, P, m), in the floating-point type of `x`.
+
+        Raises:
+            ValueError: shapes do not fit the game or each other.
+        """
+        batch, joint = x.shape[:-2], (self.game.players, self.game.state_dim)
+        if x.shape[-2:] != joint or tau.shape != batch or theta.shape != (*batch, joint[0]):
+            raise ValueError(
+                f"Expected tau (B,), x (B, {joint[0]}, {joint[1]}) and theta (B, {joint[0]}); "
+                f"got {tuple(tau.shape)}, {tuple(x.shape)} and {tuple(theta.shape)}."
+            )
+        dtype = self.operator.value_scale.dtype
+        points = Points(tau.to(dtype), x.to(dtype), theta.to(dtype))
+        return self.game.optimal_control(points.x, self.operator.field(points).costate).to(x.dtype)
 
 
 def load_policy(path: str | Path) -> OperatorPolicy:

@@ -1,0 +1,236 @@
+from __future__ import annotations
+
+import os
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+import hno
+from hno.games import make
+from hno.operators import operators
+from hno.operators.checkpoint import CheckpointError, OperatorPolicy, check_resumable, load_operator, read_checkpoint
+from hno.registry import UnknownNameError
+from hno.types import Field, Points
+from tests.operators.conftest import GAMES, MakeOperator, random_points
+
+Save = Callable[..., Path]
+
+
+@pytest.fixture
+def save(make_operator: MakeOperator, tmp_path: Path) -> Save:
+    """Write the checkpoint of a random operator, with some entries of its spec or content replaced."""
+
+    def write(game: str = "narrow_road", spec: dict[str, Any] | None = None, **content: Any) -> Path:
+        operator = make_operator(game)
+        operator.seen_types = [(1.0, 1.0), (1.0, 5.0)]
+        saved: dict[str, Any] = {"state_dict": operator.state_dict()}
+        operator.on_save_checkpoint(saved)
+        saved["hno"] |= spec or {}
+        path = tmp_path / "last.ckpt"
+        torch.save(saved | content, path)
+        return path
+
+    return write
+
+
+def refused(path: Path, **options: str) -> str:
+    with pytest.raises(CheckpointError) as error:
+        load_operator(path, **options)
+    assert str(path) in str(error.value)
+    return str(error.value)
+
+
+@pytest.mark.parametrize("game", GAMES)
+def test_round_trip(make_operator: MakeOperator, save: Save, game: str) -> None:
+    loaded, original = load_operator(save(game), game), make_operator(game)
+    points = random_points(original.game)
+    assert all(map(torch.equal, loaded.field(points), original.field(points)))
+    assert loaded.seen_types == [(1.0, 1.0), (1.0, 5.0)]
+    assert loaded.names() == {"game": game, "operator": "hno", "activation": "tanh"}
+    assert not loaded.training
+    assert not any(weights.requires_grad for weights in loaded.parameters())
+
+
+def test_changed_constants_travel_with_the_checkpoint(tmp_path: Path) -> None:
+    operator = operators.get("sno")(make("narrow_road", radius=1.4), width=8, depth=1)
+    saved: dict[str, Any] = {"state_dict": operator.state_dict()}
+    operator.on_save_checkpoint(saved)
+    torch.save(saved, tmp_path / "last.ckpt")
+    assert load_operator(tmp_path / "last.ckpt").game.radius == 1.4
+
+
+def test_missing_file(tmp_path: Path) -> None:
+    assert "There is no checkpoint at" in refused(tmp_path / "nowhere.ckpt")
+
+
+@pytest.mark.parametrize("kept", [0, 1, 100, 0.3, 0.9, 0.999])
+def test_truncated_file(save: Save, kept: float) -> None:
+    path = save()
+    content = path.read_bytes()
+    path.write_bytes(content[: int(kept * len(content)) if kept < 1 else int(kept)])
+    assert "not a readable checkpoint" in refused(path)
+
+
+def test_a_flipped_bit_in_the_pickle_is_a_checkpoint_error_or_harmless(save: Save) -> None:
+    path = save()
+    content = path.read_bytes()
+    for place in range(0, 5000, 37):
+        flipped = bytearray(content)
+        flipped[place] ^= 2
+        path.write_bytes(flipped)
+        try:
+            load_operator(path)
+        except (CheckpointError, UnknownNameError):
+            continue
+
+
+@pytest.mark.parametrize("content", [b"", b"not a checkpoint", b"PK\x03\x04 half a zip", bytes(range(256)) * 4])
+def test_foreign_bytes(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "last.ckpt"
+    path.write_bytes(content)
+    assert "not a readable checkpoint" in refused(path)
+
+
+def test_a_folder_is_no_checkpoint(tmp_path: Path) -> None:
+    refused(tmp_path)
+
+
+@pytest.mark.parametrize("content", [{"state_dict": {}}, {"weights": torch.zeros(2)}, [1, 2], torch.zeros(3)])
+def test_checkpoint_of_another_program(tmp_path: Path, content: object) -> None:
+    path = tmp_path / "other.ckpt"
+    torch.save(content, path)
+    assert "not written by this version of hno" in refused(path)
+
+
+class Trap:
+    """Unpickling this creates a file."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return os.mkdir, (str(self.path),)
+
+
+@pytest.mark.filterwarnings("ignore:Detected pickle protocol 4")
+@pytest.mark.parametrize("how", ["torch", "pickle", "inside"])
+def test_code_in_a_checkpoint_is_refused_and_not_run(save: Save, tmp_path: Path, how: str) -> None:
+    sprung, path = tmp_path / "sprung", tmp_path / "last.ckpt"
+    if how == "pickle":
+        path.write_bytes(pickle.dumps(Trap(sprung)))
+    elif how == "torch":
+        torch.save(Trap(sprung), path)
+    else:
+        path = save(extra=Trap(sprung))
+    for load in (load_operator, read_checkpoint, hno.load_policy):
+        with pytest.raises(CheckpointError, match="not a readable checkpoint"):
+            load(path)
+    assert not sprung.exists()
+    if how == "pickle":
+        pickle.loads(path.read_bytes())
+    else:
+        torch.load(path, weights_only=False)
+    assert sprung.exists(), "the trap itself works"
+
+
+def test_checkpoint_of_another_game(save: Save) -> None:
+    message = refused(save("drone"), game="narrow_road")
+    assert "'drone'" in message
+    assert "'narrow_road'" in message
+
+
+@pytest.mark.parametrize("entry", ["game", "operator"])
+def test_checkpoint_of_something_that_is_not_registered_here(save: Save, entry: str) -> None:
+    with pytest.raises(UnknownNameError, match="Known: "):
+        load_operator(save(spec={entry: "elsewhere"}))
+
+
+def test_changed_physics(save: Save, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = save()
+    monkeypatch.setattr(type(make("narrow_road")), "penalty_height", 2e4)
+    assert "another version of the game 'narrow_road'" in refused(path)
+
+
+def test_weights_of_another_network(save: Save) -> None:
+    assert "does not hold the weights" in refused(
+        save(spec={"options": {"activation": "tanh", "width": 32, "depth": 2}})
+    )
+    assert "does not hold the weights" in refused(save(state_dict={}))
+
+
+def test_another_format_or_an_incomplete_spec(save: Save) -> None:
+    assert "not written by this version" in refused(save(spec={"format": 99}))
+    assert "not complete" in refused(save(hno={"format": 1, "game": "narrow_road"}))
+
+
+def test_resuming_asks_for_the_same_game_operator_and_network(make_operator: MakeOperator, save: Save) -> None:
+    path = save()
+    check_resumable(path, make_operator())
+    for other in (
+        make_operator("drone"),
+        make_operator(name="sno"),
+        make_operator(width=32),
+        make_operator(activation="sin"),
+    ):
+        with pytest.raises(CheckpointError, match="Resume with its own configuration"):
+            check_resumable(path, other)
+
+
+def car_controls(own: Tensor) -> Tensor:
+    """(angular velocity, acceleration) as the paper states them."""
+    return torch.stack([(own[..., 2] / 200).clamp(-1, 1), (own[..., 3] / 2).clamp(-5, 10)], -1)
+
+
+def drone_controls(own: Tensor) -> Tensor:
+    """(roll, pitch, thrust) as the paper states them."""
+    limit = torch.tensor(0.05).tan()
+    roll = (9.81 * own[..., 3] / 200).clamp(-limit, limit).atan()
+    pitch = (-9.81 * own[..., 4] / 200).clamp(-limit, limit).atan()
+    return torch.stack([roll, pitch, (own[..., 5] / 2).clamp(-2, 2) + 9.81], -1)
+
+
+PAPER = {"narrow_road": car_controls, "lane_change": car_controls, "drone": drone_controls}
+
+
+@pytest.mark.parametrize("game", GAMES)
+@pytest.mark.parametrize("size", [1.0, 40.0, 4000.0])
+def test_policy_plays_the_controls_of_the_paper(save: Save, game: str, size: float) -> None:
+    path = save(game)
+    policy = hno.load_policy(path)
+    policy.operator.value_scale.fill_(size)
+    points = random_points(policy.game, 50)
+    u = policy(*points)
+    assert u.shape == (50, 2, policy.game.control_dim)
+    box = policy.game.control_box
+    assert bool(((u >= box.lo - 1e-6) & (u <= box.hi + 1e-6)).all())
+    costate = policy.operator.field(points).costate
+    own = torch.stack([costate[:, 0, 0], costate[:, 1, 1]], 1)
+    torch.testing.assert_close(u, PAPER[game](own), rtol=1e-5, atol=1e-6)
+
+
+def test_policy_reads_own_costates_only(make_operator: MakeOperator, monkeypatch: pytest.MonkeyPatch) -> None:
+    operator = make_operator()
+    policy, points = OperatorPolicy(operator), random_points(operator.game)
+    before, field = policy(*points), operator.field
+
+    def with_other_cross_costates(at: Points) -> Field:
+        known = field(at)
+        costate = known.costate.clone()
+        costate[:, 0, 1] += 100
+        costate[:, 1, 0] -= 100
+        return known._replace(costate=costate)
+
+    monkeypatch.setattr(operator, "field", with_other_cross_costates)
+    assert torch.equal(policy(*points), before)
+
+
+def test_policy_works_where_gradients_are_switched_off(save: Save) -> None:
+    policy = hno.load_policy(save())
+    points = random_points(policy.game)
+    with torch.no_grad():
+        assert torch.equal(policy(*points), policy(*points))
