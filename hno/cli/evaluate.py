@@ -9,6 +9,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
@@ -29,6 +30,8 @@ log = logging.getLogger(__name__)
 
 GRIDS = {"grid5": 5, "grid9": 9}
 """Named grids over the type box: points per player."""
+UNSEEN = ((1.0, 2.0), (2.0, 2.0), (2.0, 4.0), (4.0, 5.0))
+"""Types that are evaluated by default beside those of the training, where the game has them."""
 
 
 def main() -> None:
@@ -76,7 +79,7 @@ def parse_types(text: str, policy: OperatorPolicy) -> list[tuple[float, ...]]:
     """
     game = policy.game
     if text == "default":
-        unseen = [(1.0, 2.0), (2.0, 2.0), (2.0, 4.0), (4.0, 5.0)] if game.players == 2 else []
+        unseen = [theta for theta in UNSEEN if game.players == 2 and bool(game.type_box.contains(torch.tensor(theta)))]
         return list(dict.fromkeys([*policy.operator.seen_types, *unseen]))
     if text in GRIDS:
         corners = zip(game.type_box.lo.tolist(), game.type_box.hi.tolist(), strict=True)

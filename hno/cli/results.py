@@ -79,7 +79,11 @@ class Results:
         text = json.dumps(finite(self.content), indent=2, allow_nan=False)
         self.path.parent.mkdir(parents=True, exist_ok=True)
         handle, temporary = tempfile.mkstemp(dir=self.path.parent, prefix=".results.")
-        with os.fdopen(handle, "w") as file:
-            file.write(text + "\n")
-        Path(temporary).chmod(0o644)
-        Path(temporary).replace(self.path)
+        try:
+            with os.fdopen(handle, "w") as file:
+                file.write(text + "\n")
+            Path(temporary).chmod(0o644)
+            Path(temporary).replace(self.path)
+        except BaseException:
+            Path(temporary).unlink(missing_ok=True)
+            raise

@@ -84,9 +84,8 @@ def _run(config: DictConfig, folder: Path, results: Results) -> None:
 
     began = time.perf_counter()
     trainer.fit(operator, datamodule=data, ckpt_path=config.resume, weights_only=True)
-    trainer.save_checkpoint(
-        folder / "last.ckpt", weights_only=False
-    )  # the last step need not be a multiple of trainer.validate_every
+    # The callback saves at multiples of trainer.validate_every, which the last step need not be.
+    trainer.save_checkpoint(folder / "last.ckpt", weights_only=False)
     results.time("training", time.perf_counter() - began)
     metrics = {name: float(value) for name, value in trainer.callback_metrics.items()}
     results.update(steps=trainer.global_step, checkpoint="last.ckpt", metrics=metrics)

@@ -139,7 +139,8 @@ def _solve_all(
     game: Game, requests: Sequence[Request], jobs: Sequence[tuple[int, Tensor]], settings: Solver, workers: int | None
 ) -> Any:
     workers = min(workers or os.cpu_count() or 1, len(jobs))
-    tasks = ((game, part, torch.tensor(requests[i].theta).expand(len(part), -1), settings) for i, part in jobs)
+    types = [torch.tensor(request.theta, dtype=torch.float64) for request in requests]
+    tasks = ((game, part, types[i].expand(len(part), -1), settings) for i, part in jobs)
     if workers <= 1:
         return (solve(*task) for task in tasks)
     pool = joblib.Parallel(n_jobs=workers, return_as="generator", inner_max_num_threads=1, backend="loky")

@@ -20,7 +20,7 @@ class Search(NamedTuple):
     """Sizes of the evasive manoeuvres that are tried, in half widths of the control box."""
     margin: float = 0.6
     """Constraint tightening while the manoeuvres are sorted out, m for distance constraints."""
-    rounds: tuple[tuple[int, int], ...] = ((4, 5), (8, 3))
+    rounds: tuple[tuple[int, int], ...] = ((4, 4), (8, 2))
     """Descent iterations with the margin, and the number of manoeuvres per state that are kept after them."""
     fine_iterations: int = 25
     """Descent iterations without the margin, for the manoeuvres that are kept at last."""

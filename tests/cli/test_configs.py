@@ -1,0 +1,92 @@
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import product
+from pathlib import Path
+
+import hydra
+import pytest
+from omegaconf import DictConfig, OmegaConf
+
+from hno.cli.build import build_data, build_game, build_operator, check_numbers, plain
+from hno.cli.config import choices, config_dir, register_plugins
+from hno.cli.results import config_hash
+from hno.losses import STREAMS
+
+GROUPS = sorted(path.name for path in config_dir().iterdir() if path.is_dir())
+CHOICES = [(group, path.stem) for group in GROUPS for path in sorted((config_dir() / group).glob("*.yaml"))]
+GAMES, OPERATORS, ACTIVATIONS = ("narrow_road", "lane_change", "drone"), ("hno", "sno"), ("tanh", "sin", "relu")
+
+
+@pytest.fixture(autouse=True)
+def hydra_here() -> Iterator[None]:
+    register_plugins()
+    with hydra.initialize_config_dir(str(config_dir()), version_base="1.3"):
+        yield
+
+
+def composed(*overrides: str, name: str = "train") -> DictConfig:
+    """A configuration with all its interpolations resolved and nothing missing."""
+    config = hydra.compose(name, overrides=list(overrides))
+    OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    return config
+
+
+@pytest.mark.parametrize(("group", "choice"), CHOICES)
+def test_every_choice_of_every_group_composes(group: str, choice: str) -> None:
+    check_numbers(composed(f"{group}={choice}"))
+
+
+@pytest.mark.parametrize("experiment", [choice for group, choice in CHOICES if group == "experiment"])
+@pytest.mark.parametrize(("game", "operator"), list(product(GAMES, OPERATORS)))
+def test_every_experiment_builds_for_every_game_and_operator(experiment: str, game: str, operator: str) -> None:
+    config = composed(f"experiment={experiment}", f"game={game}", f"operator={operator}")
+    check_numbers(config)
+    built = build_operator(config, build_game(config))
+    assert build_data(config, built).streams == (STREAMS if operator == "hno" else {"bvp"})
+
+
+@pytest.mark.parametrize(("game", "operator", "activation"), list(product(GAMES, OPERATORS, ACTIVATIONS)))
+def test_every_combination_is_built_as_named(game: str, operator: str, activation: str) -> None:
+    config = composed(f"game={game}", f"operator={operator}", f"activation={activation}")
+    built = build_operator(config, build_game(config))
+    assert built.names() == {"game": game, "operator": operator, "activation": activation}
+
+
+def test_every_registered_class_has_a_choice() -> None:
+    assert set(GAMES) <= set(choices("game"))
+    assert set(OPERATORS) <= set(choices("operator"))
+    assert set(ACTIVATIONS) <= set(choices("activation"))
+
+
+def test_evaluation_composes() -> None:
+    assert composed("checkpoint=some.ckpt", name="evaluate").theta == "default"
+
+
+def test_physics_stays_out_of_the_configuration() -> None:
+    for game in GAMES:
+        assert plain(composed(f"game={game}").game) == {"name": game, "constants": {}}
+
+
+def test_paper_recipe_is_the_published_one() -> None:
+    config = composed("experiment=paper", "game=lane_change", "operator=sno")
+    assert config.trainer.max_steps == 300_000
+    assert (config.optimizer.name, config.optimizer.lr, config.optimizer.schedule) == ("adam", 1e-4, "constant")
+    assert config.data.trajectories == 2000
+    assert plain(config.sampler) == {"box": 1.0, "band": 0.0, "labels": 0.0}
+    curriculum = build_data(config, build_operator(config, build_game(config))).curriculum
+    assert curriculum == (100_000, 200_000)
+
+
+def test_hash_names_what_determines_the_numbers() -> None:
+    base = config_hash(composed())
+    assert config_hash(composed()) == base
+    for same in ("logger=csv", "resume=/some/last.ckpt", "data.cache=/some", "data.workers=1", "trainer.threads=1"):
+        assert config_hash(composed(same)) == base
+    for other in ("seed=1", "game=drone", "operator=sno", "activation=sin", "optimizer.lr=1e-4", "data.trajectories=8"):
+        assert config_hash(composed(other)) != base
+
+
+def test_configuration_is_found_beside_the_package() -> None:
+    assert (config_dir() / "train.yaml").is_file()
+    assert not list(Path(config_dir()).rglob("*.py"))
