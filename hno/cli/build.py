@@ -43,8 +43,10 @@ def check_numbers(config: DictConfig) -> None:
         raise ValueError(f"optimizer.lr must be a positive number; got {config.optimizer.lr!r}.")
     if not (isinstance(config.seed, int) and config.seed >= 0):
         raise ValueError(f"seed must be a whole number of at least 0; got {config.seed!r}.")
-    if not (OmegaConf.is_list(config.data.types) and config.data.types):
-        raise ValueError(f"data.types must list player types, such as [[1, 1], [5, 5]]; got {config.data.types!r}.")
+    for name, needed in (("data.types", True), ("evaluation.types", False)):
+        value = OmegaConf.select(config, name)
+        if not OmegaConf.is_list(value) or (needed and not value):
+            raise ValueError(f"{name} must list player types, such as [[1, 1], [5, 5]]; got {value!r}.")
     for name in ("data.pretrain", "data.widening"):
         value = OmegaConf.select(config, name)
         if not (isinstance(value, (int, float)) and 0 <= value <= 1):

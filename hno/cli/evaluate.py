@@ -57,12 +57,15 @@ def evaluate(config: DictConfig) -> bool:
         results.update(status="failed", reason=f"{type(error).__name__}: {error}")
         report(error)
         return False
+    except (KeyboardInterrupt, SystemExit):  # Lightning turns the one into the other
+        results.update(status="failed", reason="interrupted")
+        raise
     show(results.content, folder)
     return True
 
 
 def _run(config: DictConfig, results: Results) -> None:
-    policy = OperatorPolicy(load_operator(config.checkpoint, config.game))
+    policy = OperatorPolicy(load_operator(config.checkpoint, config.expected_game))
     operator = policy.operator
     results.update(**operator.names())
     types = parse_types(config.theta, policy)

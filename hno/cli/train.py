@@ -54,6 +54,9 @@ def train(config: DictConfig) -> bool:
         results.update(status="failed", reason=f"{type(error).__name__}: {error}")
         report(error)
         return False
+    except (KeyboardInterrupt, SystemExit):  # Lightning turns the one into the other
+        results.update(status="failed", reason="interrupted")
+        raise
     finally:
         wandb.finish(exit_code=int(results.content["status"] != "finished"))
     show(results.content, folder)

@@ -10,10 +10,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
+import torch
 
 from hno.cli import evaluate, train
+from hno.data import datamodule
+from hno.games import make
+from hno.operators import operators
 
-SMOKE = ("experiment=smoke", "data.types=[[1,1]]", "data.workers=1")
+SMOKE = ("experiment=smoke", "data.types=[[1,1]]", "data.workers=1", "evaluation.dt=0.1")
 """A run of seconds, on labels that every test shares."""
 
 
@@ -59,11 +63,12 @@ def clean_globals() -> Iterator[None]:
 def command(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path, clean_globals: None
 ) -> Command:
-    """Run train.py or evaluate.py in this process, as the command line would."""
+    """Run train.py or evaluate.py in this process, as the command line would, but without drawing pictures."""
+    monkeypatch.setattr(evaluate, "draw", lambda *arguments: None)
     mains = {"train": train.main, "evaluate": evaluate.main}
 
     def run(name: str, *overrides: str, folder: Path = tmp_path / "run") -> Outcome:
-        monkeypatch.setattr(sys, "argv", [f"{name}.py", f"hydra.run.dir={folder}", *overrides])
+        monkeypatch.setattr(sys, "argv", [f"{name}.py", *overrides, f"hydra.run.dir={folder}"])
         capsys.readouterr()
         code: int | str | None = 0
         try:
@@ -76,3 +81,37 @@ def command(
         return Outcome(code or 0, printed, folder)
 
     return run
+
+
+@pytest.fixture
+def no_labels(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Expensive work fails the test: what can be known before must be said before."""
+
+    def never(*arguments: object, **options: object) -> None:
+        raise AssertionError("labels were asked for")
+
+    monkeypatch.setattr(datamodule, "labels_for", never)
+    monkeypatch.setattr(evaluate, "labels_for", never)
+
+
+def refused(run: Outcome, *fragments: str) -> None:
+    """The command failed with one clear message."""
+    assert run.code != 0
+    for fragment in fragments:
+        assert fragment in run.text
+    assert "Traceback" not in run.text
+    assert "labels were asked for" not in run.text
+
+
+@pytest.fixture
+def random_checkpoint(tmp_path: Path) -> Path:
+    """A narrow-road operator with random weights, as training would have saved it."""
+    torch.manual_seed(0)
+    operator = operators.get("hno")(make("narrow_road"), width=16, depth=2)
+    operator.seen_types = [(1.0, 1.0)]
+    content: dict[str, Any] = {"state_dict": operator.state_dict()}
+    operator.on_save_checkpoint(content)
+    path = tmp_path / "random" / "last.ckpt"
+    path.parent.mkdir()
+    torch.save(content, path)
+    return path

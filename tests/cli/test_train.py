@@ -2,7 +2,8 @@ from __future__ import annotations
 
 import csv
 import itertools
-from collections.abc import Callable
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,8 @@ import torch
 from torch import Tensor
 
 import hno
+from hno.cli import evaluate
+from hno.cli.evaluate import draw
 from hno.cli.results import Results
 from hno.evaluation.callbacks import StopOnDivergence
 from hno.evaluation.closed_loop import TypeRow
@@ -100,6 +103,12 @@ def test_last_checkpoint_is_that_of_the_last_step(command: Command, steps: int, 
     assert [path.name for path in run.folder.glob("*.ckpt")] == ["last.ckpt"]
 
 
+def test_run_leaves_a_picture_of_an_episode(command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(evaluate, "draw", draw)
+    run = command("train", *SMOKE, "trainer.max_steps=1")
+    assert (run.folder / "rollout.png").read_bytes().startswith(b"\x89PNG")
+
+
 def test_label_sizes_are_the_scales_of_the_network(command: Command) -> None:
     scaled = command("train", *SMOKE, "trainer.max_steps=1")
     assert float(weights(scaled.folder)["value_scale"]) > 1
@@ -110,30 +119,27 @@ def test_label_sizes_are_the_scales_of_the_network(command: Command) -> None:
 SIX = (*SMOKE, "trainer.max_steps=6", "trainer.validate_every=3")
 
 
-@pytest.fixture
-def power_cut(monkeypatch: pytest.MonkeyPatch) -> Callable[[BaseException], None]:
-    """Let the next trainings end with an error in step 5."""
+@contextmanager
+def power_cut(error: BaseException) -> Iterator[None]:
+    """Let trainings end with an error in step 5."""
 
-    def arm(error: BaseException) -> None:
-        def cut(self: StopOnDivergence, trainer: Any, *others: Any) -> None:
-            if trainer.global_step == 5:
-                raise error
+    def cut(self: StopOnDivergence, trainer: Any, *others: Any) -> None:
+        if trainer.global_step == 5:
+            raise error
 
-        monkeypatch.setattr(StopOnDivergence, "on_train_batch_end", cut)
-
-    return arm
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(StopOnDivergence, "on_train_batch_end", cut)
+        yield
 
 
 @pytest.mark.parametrize("optimizer", ["soap", "adam"])
 def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(
-    command: Command, power_cut: Callable[..., None], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, optimizer: str
+    command: Command, tmp_path: Path, optimizer: str
 ) -> None:
     recipe = (*SIX, f"optimizer={optimizer}")
     whole = command("train", *recipe, folder=tmp_path / "whole")
-    with monkeypatch.context():
-        power_cut(RuntimeError("power cut"))
+    with power_cut(RuntimeError("power cut")):
         cut = command("train", *recipe, folder=tmp_path / "cut")
-    monkeypatch.undo()
     assert (whole.code, cut.code) == (0, 1)
     kept = (cut.folder / "last.ckpt").read_bytes()
     assert torch.load(cut.folder / "last.ckpt", weights_only=True)["global_step"] == 3
@@ -146,9 +152,9 @@ def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(
     assert resumed.results["table"] == whole.results["table"]
 
 
-def test_failure_in_training_is_in_the_results(command: Command, power_cut: Callable[..., None]) -> None:
-    power_cut(RuntimeError("power cut"))
-    run = command("train", *SIX)
+def test_failure_in_training_is_in_the_results(command: Command) -> None:
+    with power_cut(RuntimeError("power cut")):
+        run = command("train", *SIX)
     assert run.code == 1
     assert "power cut" in run.text
     assert "Traceback" not in run.text
@@ -159,12 +165,11 @@ def test_failure_in_training_is_in_the_results(command: Command, power_cut: Call
     assert "labels" in results["seconds"]
 
 
-def test_an_interrupted_run_says_so(command: Command, power_cut: Callable[..., None]) -> None:
-    power_cut(KeyboardInterrupt())
-    run = command("train", *SIX)
+def test_an_interrupted_run_says_so(command: Command) -> None:
+    with power_cut(KeyboardInterrupt()):
+        run = command("train", *SIX)
     assert run.code != 0
-    assert run.results["status"] != "finished"
-    assert run.results["status"] != "running"
+    assert (run.results["status"], run.results["reason"]) == ("failed", "interrupted")
 
 
 @pytest.mark.parametrize("activation", ACTIVATIONS)

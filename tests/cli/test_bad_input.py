@@ -1,0 +1,177 @@
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+
+from hno.data import datamodule
+from hno.types import Extremal
+from tests.cli.conftest import SMOKE, Command, refused
+from tests.conftest import TEST, TRAIN
+
+
+@pytest.mark.usefixtures("no_labels")
+@pytest.mark.parametrize(
+    ("override", "near"),
+    [
+        ("game=narow_road", "'narrow_road'"),
+        ("game=lane-change", "'lane_change'"),
+        ("operator=hmo", "'hno'"),
+        ("activation=tan", "'tanh'"),
+        ("optimizer=adm", "'adam'"),
+        ("experiment=smok", "'smoke'"),
+        ("logger=wandbb", "'wandb'"),
+        ("game.name=dron", "'drone'"),
+        ("operator.name=snoo", "'sno'"),
+        ("activation.name=sine", "'sin'"),
+        ("optimizer.name=soop", "'soap'"),
+        ("optimizer.schedule=cosin", "'cosine'"),
+        ("logger.names=[csw]", "'csv'"),
+        ("+game.constants.radios=2", "'radius'"),
+        ("trainer.max_step=5", "'max_steps'"),
+        ("actvation=sin", "'activation'"),
+        ("data.trajectorys=5", "'trajectories'"),
+    ],
+)
+def test_unknown_names_are_answered_with_the_list_and_the_nearest(command: Command, override: str, near: str) -> None:
+    refused(command("train", *SMOKE, override), "Known: ", f"Did you mean {near}?")
+
+
+@pytest.mark.usefixtures("no_labels")
+@pytest.mark.parametrize(
+    ("types", "message"),
+    [
+        ("[[1]]", "2 finite numbers, one per player; got [1]"),
+        ("[[1,2,3]]", "2 finite numbers, one per player; got [1, 2, 3]"),
+        ("[[1,nan]]", "2 finite numbers"),
+        ("[[inf,1]]", "2 finite numbers"),
+        ("[[1,one]]", "2 finite numbers"),
+        ("[1,1]", "2 finite numbers"),
+        ("5", "types must list player types"),
+        ("null", "types must list player types"),
+    ],
+)
+@pytest.mark.parametrize("entry", ["data.types", "evaluation.types"])
+def test_impossible_types(command: Command, entry: str, types: str, message: str) -> None:
+    run = command("train", *SMOKE, f"{entry}={types}")
+    refused(run, message)
+    assert run.results["status"] == "failed"
+    assert message in run.results["reason"]
+
+
+@pytest.mark.usefixtures("no_labels")
+def test_training_needs_a_type(command: Command) -> None:
+    refused(command("train", *SMOKE, "data.types=[]"), "data.types must list player types")
+
+
+def test_types_outside_the_range_are_a_visible_warning(command: Command) -> None:
+    run = command("train", *SMOKE, "trainer.max_steps=1", "evaluation.types=[[0.5,1]]")
+    assert run.code == 0, run.text
+    assert "ExtrapolationWarning: theta = (0.5, 1.0) lies outside the types [1.0, 1.0] to [5.0, 5.0]" in run.text
+    assert "extrapolate" in (run.folder / "train.log").read_text()
+    assert [row["theta"] for row in run.results["table"]] == [[1.0, 1.0], [0.5, 1.0]]
+
+
+def test_types_inside_the_range_warn_of_nothing(command: Command) -> None:
+    assert "extrapolate" not in command("train", *SMOKE, "trainer.max_steps=1").text
+
+
+@pytest.mark.usefixtures("no_labels")
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        *((f"{name}={size}", name) for size in ("0", "-3", "1.5", "many") for name in (
+            "trainer.max_steps", "data.trajectories", "operator.width", "evaluation.starts",
+        )),
+        *((f"{name}=0", name) for name in (
+            "operator.depth", "data.validation", "data.workers", "trainer.validate_every", "trainer.print_every",
+            "trainer.threads", "optimizer.lr",
+        )),
+        ("data.batch_sizes.bvp=0", "'bvp' must be at least 1"),
+        ("data.batch_sizes.interior=-8", "'interior' must be at least 1"),
+        ("optimizer.lr=-0.1", "optimizer.lr must be a positive number"),
+        ("optimizer.lr=nan", "optimizer.lr must be a positive number"),
+        ("data.pretrain=1.2", "data.pretrain is a share"),
+        ("data.widening=-0.1", "data.widening is a share"),
+        ("sampler.band=-1", "Sampler shares"),
+        ("evaluation.clearance=-0.1", "clearance must be"),
+        ("evaluation.dt=0", "dt must be"),
+        ("evaluation.dt=0.07", "divides the horizon of 3 s"),
+        ("loss.weights.value=-1", "Loss weights"),
+        ("loss.weights.residual=nan", "Loss weights"),
+        ("loss.norm=l7", "huber, l1, l2"),
+        ("data.interior_types=ring", "'labelled' or 'box'"),
+        ("seed=-1", "seed must be"),
+    ],
+)  # fmt: skip
+def test_impossible_numbers(command: Command, override: str, message: str) -> None:
+    run = command("train", *SMOKE, override)
+    refused(run, message)
+    assert run.results["status"] == "failed"
+
+
+@pytest.mark.usefixtures("no_labels")
+@pytest.mark.parametrize("options", [(), ("-m",)])
+def test_unwritable_output_folder(command: Command, options: tuple[str, ...]) -> None:
+    run = command("train", *options, *SMOKE, "hydra.sweep.dir=/proc/nowhere", folder=Path("/proc/nowhere"))
+    refused(run, "output folder cannot be written", "/proc/nowhere", "hydra.run.dir=<folder>")
+
+
+def test_unwritable_label_folder(command: Command) -> None:
+    run = command("train", *SMOKE, "data.cache=/proc/nowhere")
+    refused(run, "Labels cannot be written to /proc/nowhere")
+    assert run.results["status"] == "failed"
+
+
+@pytest.fixture
+def own_cache(labels: Callable[..., Extremal], cache: Path, tmp_path: Path) -> Path:
+    """A copy of the labels that a smoke run needs."""
+    labels("narrow_road", TRAIN)
+    labels("narrow_road", TEST)
+    return Path(shutil.copytree(cache / "NarrowRoad", tmp_path / "labels" / "NarrowRoad")).parent
+
+
+@pytest.mark.parametrize("split", ["train", "test"])
+@pytest.mark.parametrize("damage", ["truncated", "flipped"])
+def test_damaged_label_file(command: Command, own_cache: Path, split: str, damage: str) -> None:
+    (path,) = own_cache.rglob(f"1-1_{split}*_n4_*.safetensors")
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content[:-100] if damage == "truncated" else content)
+    before = {file: file.read_bytes() for file in own_cache.rglob("*") if file.is_file()}
+    run = command("train", *SMOKE, "trainer.max_steps=1", f"data.cache={own_cache}")
+    refused(run, str(path), "Move it away and run again")
+    assert run.results["reason"].startswith("LabelFileError")
+    assert {file: file.read_bytes() for file in own_cache.rglob("*") if file.is_file()} == before
+
+
+def test_a_label_file_that_was_moved_away_is_solved_again(command: Command, own_cache: Path) -> None:
+    (path,) = own_cache.rglob("1-1_test*_n4_*.safetensors")
+    before = path.read_bytes()
+    path.unlink()
+    assert command("train", *SMOKE, "trainer.max_steps=1", f"data.cache={own_cache}").code == 0
+    assert path.read_bytes() == before
+
+
+@pytest.mark.usefixtures("no_labels")
+def test_resuming_from_something_else(command: Command, tmp_path: Path, random_checkpoint: Path) -> None:
+    before = random_checkpoint.read_bytes()
+    refused(command("train", *SMOKE, "resume=/nowhere/last.ckpt"), "There is no checkpoint at /nowhere/last.ckpt")
+    refused(command("train", *SMOKE, "game=drone", f"resume={random_checkpoint}"), "'narrow_road', expected 'drone'")
+    refused(command("train", *SMOKE, "operator.width=8", f"resume={random_checkpoint}"), "options")
+    foreign = tmp_path / "foreign.ckpt"
+    foreign.write_bytes(b"these are no weights")
+    refused(command("train", *SMOKE, f"resume={foreign}"), "not a readable checkpoint")
+    assert random_checkpoint.read_bytes() == before
+
+
+def test_every_label_failed(command: Command, monkeypatch: pytest.MonkeyPatch, labels: Callable[..., Extremal]) -> None:
+    found = labels("narrow_road", TRAIN)
+    stalled = found._replace(status=torch.ones_like(found.status))
+    monkeypatch.setattr(datamodule, "labels_for", lambda *arguments: ([stalled], 0.0))
+    run = command("train", *SMOKE)
+    refused(run, "None of 3 boundary value problems of NarrowRoad converged")
+    assert run.results["reason"].startswith("NoLabelsError")
