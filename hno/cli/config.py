@@ -55,6 +55,8 @@ def check_choices(arguments: Sequence[str]) -> None:
     Raises:
         SystemExit: a choice does not exist.
     """
+    if any(argument.startswith(("--config-dir", "-cd")) for argument in arguments):
+        return  # choices may come from the user's own folder; Hydra lists them
     groups = {path.name for path in config_dir().iterdir() if path.is_dir()}
     for argument in arguments:
         match = re.fullmatch(r"\+?([a-z_]+)=([\w.,-]+)", argument)
@@ -69,6 +71,8 @@ def explain(error: Exception) -> str:
     """The message of a configuration error; unknown keys come with the known ones and the nearest."""
     cause = error.__cause__
     if isinstance(cause, (ConfigAttributeError, ConfigKeyError)) and isinstance(cause.parent_node, DictConfig):
+        if str(cause.full_key).startswith("game.constants."):
+            return f"Constants of a game need a plus sign: write +{cause.full_key}=<value>."
         known = sorted(str(key) for key in cause.parent_node)
         return f"{cause.full_key} does not exist. " + unknown_name("configuration key", str(cause.key), known)
     return str(error)

@@ -149,9 +149,14 @@ class GameData(L.LightningDataModule):
         self.val_rows = rows_of(self.game, [_part(found, slice(held_out, None)) for found in self.extremals])
 
     def label_scales(self) -> tuple[Tensor, Tensor]:
-        """Mean absolute value, scalar, and mean absolute costate, (P, P, n), of the training labels."""
+        """Mean absolute value, scalar, and mean absolute costate, (P, P, n), of the training labels.
+
+        A state that hardly matters keeps a thousandth of value / box width, so that dividing by its size is safe.
+        """
         labels = self.train_rows.labels
-        return labels.value.abs().mean(), labels.costate.abs().mean(0)
+        value = labels.value.abs().mean()
+        value = torch.where(value > 0, value, torch.ones_like(value))
+        return value, labels.costate.abs().mean(0).maximum(1e-3 * value / self.game.state_box.width)
 
     def batch(self, step: int) -> Batch:
         """The batch of one step, a pure function of (seed, step, rank)."""

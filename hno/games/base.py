@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import copy
 import hashlib
 import math
 import warnings
@@ -181,18 +182,35 @@ class Game(nn.Module, abc.ABC):
             checked.append(entries)
         return checked
 
+    def check_theta(self, theta: Tensor) -> None:
+        """Refuse types that are not finite, and warn of those outside the type box.
+
+        Raises:
+            ValueError: an entry of `theta` (B, P) is NaN or infinite.
+        """
+        if not bool(theta.isfinite().all()):
+            raise ValueError(f"theta must be finite; got {theta.tolist()}.")
+        if not bool(self.type_box.contains(theta).all()):
+            lo, hi = self.type_box.lo.tolist(), self.type_box.hi.tolist()
+            message = f"theta lies outside the types {lo} to {hi} of the game: results extrapolate."
+            warnings.warn(message, ExtrapolationWarning, stacklevel=3)
+
     def fingerprint(self) -> str:
-        """Hash of the game's boxes and of its functions at fixed points: it changes when the physics does."""
+        """Hash of the game's boxes and of its functions at fixed points: it changes when the physics does.
+
+        It is taken on the CPU in float64, so that it is the same wherever the game is.
+        """
+        game = copy.deepcopy(self).cpu().double()
         generator = torch.Generator().manual_seed(0)
-        game = type(self).__name__, self.horizon, self.label_step, self.roles
-        boxes = [self.state_box, self.initial_box, self.control_box, self.type_box]
-        x, u, theta = (box.sample(16, generator) for box in (self.state_box, self.control_box, self.type_box))
-        u = u.unsqueeze(-2).expand(-1, self.players, -1)
-        values = [b for box in boxes for b in (box.lo, box.hi)]
-        values += [self.dynamics(x, u), self.effort(u), self.terminal_value(x), self.constraint(x, theta)]
-        values += [self.penalty(torch.linspace(-2, 2, 9))]
-        digits = [f"{v:.4e}" for tensor in values for v in tensor.double().flatten().tolist()]
-        return hashlib.sha256(repr((game, digits)).encode()).hexdigest()[:16]
+        boxes = [game.state_box, game.initial_box, game.control_box, game.type_box]
+        x, theta = game.state_box.sample(16, generator), game.type_box.sample(16, generator)
+        u = game.control_box.sample(16, generator).unsqueeze(-2).expand(-1, game.players, -1)
+        values = [corner for box in boxes for corner in (box.lo, box.hi)]
+        values += [game.dynamics(x, u), game.effort(u), game.terminal_value(x), game.constraint(x, theta)]
+        values += [game.sensors(theta), game.positions(x), game.penalty(torch.linspace(-2, 2, 9, dtype=x.dtype))]
+        digits = [f"{v:.4e}" for tensor in values for v in tensor.flatten().tolist()]
+        text = repr((type(self).__name__, self.horizon, self.label_step, self.roles, digits))
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 class ControlAffineGame(Game):

@@ -114,8 +114,8 @@ class ValueOperator(L.LightningModule, abc.ABC):
             points: where, physical units.
             create_graph: keep the result differentiable in the parameters.
         """
-        with torch.enable_grad():
-            tau = points.tau.unsqueeze(-1).expand_as(points.theta).detach().requires_grad_()
+        with torch.inference_mode(mode=False), torch.enable_grad():
+            tau = points.tau.unsqueeze(-1).expand_as(points.theta).detach().clone().requires_grad_()
             views = ego_views(self.game.state_box.scale(points.x)).detach().requires_grad_()
             value = self._value(tau, views, points.theta)
             slope, per_view = torch.autograd.grad(value.sum(), (tau, views), create_graph=create_graph)

@@ -109,7 +109,7 @@ class OperatorPolicy:
         """Controls in physical units, (B,), (B, P, n), (B, P) -> (B, P, m), in the floating-point type of `x`.
 
         Raises:
-            ValueError: shapes do not fit the game or each other.
+            ValueError: shapes do not fit the game or each other, or an entry is not finite.
         """
         batch, joint = x.shape[:-2], (self.game.players, self.game.state_dim)
         if x.shape[-2:] != joint or tau.shape != batch or theta.shape != (*batch, joint[0]):
@@ -117,6 +117,9 @@ class OperatorPolicy:
                 f"Expected tau (B,), x (B, {joint[0]}, {joint[1]}) and theta (B, {joint[0]}); "
                 f"got {tuple(tau.shape)}, {tuple(x.shape)} and {tuple(theta.shape)}."
             )
+        self.game.check_theta(theta)
+        if not bool(tau.isfinite().all() & x.isfinite().all()):
+            raise ValueError("tau and x must be finite; a controller has no answer to NaN or infinite entries.")
         dtype = self.operator.value_scale.dtype
         points = Points(tau.to(dtype), x.to(dtype), theta.to(dtype))
         return self.game.optimal_control(points.x, self.operator.field(points).costate).to(x.dtype)

@@ -73,15 +73,6 @@ def _first_bad_row(tensor: Tensor) -> int:
     return int((~tensor.isfinite()).flatten(1).any(-1).nonzero()[0])
 
 
-class _Candidates(NamedTuple):
-    """Converged or failed solutions from every start, rows = (state, start)."""
-
-    mesh: Mesh
-    z: Tensor
-    residual: Tensor
-    status: Tensor
-
-
 def _solve_chunk(game: Game, x0: Tensor, theta: Tensor, settings: Solver) -> Extremal:
     with torch.no_grad():
         starts = find_starts(game, x0, theta, settings.search)
