@@ -30,8 +30,6 @@ log = logging.getLogger(__name__)
 
 GRIDS = {"grid5": 5, "grid9": 9}
 """Named grids over the type box: points per player."""
-UNSEEN = ((1.0, 2.0), (2.0, 2.0), (2.0, 4.0), (4.0, 5.0))
-"""Types that are evaluated by default beside those of the training, where the game has them."""
 
 
 def main() -> None:
@@ -68,22 +66,27 @@ def _run(config: DictConfig, results: Results) -> None:
     policy = OperatorPolicy(load_operator(config.checkpoint, config.expected_game))
     operator = policy.operator
     results.update(**operator.names())
-    types = parse_types(config.theta, policy)
-    settings = {name: config[name] for name in ("starts", "seed", "clearance", "dt")}
-    evaluate_policy(policy, types, cache_folder(config.cache), config.workers, results, **settings)
+    check_evaluation(policy.game, config)
+    types = parse_types(config.theta, policy, config.unseen)
+    cache = cache_folder(config.cache)
+    labels = solve_tests(policy.game, types, config.starts, config.seed, cache, config.workers, results)
+    evaluate_policy(policy, labels, results, config.clearance, config.dt)
     results.update(status="finished")
 
 
-def parse_types(text: str, policy: OperatorPolicy) -> list[tuple[float, ...]]:
+def parse_types(text: str, policy: OperatorPolicy, unseen: Sequence[Sequence[float]] = ()) -> list[tuple[float, ...]]:
     """Player types from "default", a named grid, or a list such as "1,1;2.5,4".
+
+    Default are the labelled types, and those of `unseen` that lie in the game's type box.
 
     Raises:
         ValueError: none of these, or entries that are not one finite number per player.
     """
     game = policy.game
     if text == "default":
-        unseen = [theta for theta in UNSEEN if game.players == 2 and bool(game.type_box.contains(torch.tensor(theta)))]
-        return list(dict.fromkeys([*policy.operator.seen_types, *unseen]))
+        own = [theta for theta in unseen if len(theta) == game.players]
+        inside = [theta for theta in own if bool(game.type_box.contains(torch.tensor(theta)))]
+        return list(dict.fromkeys([*policy.operator.seen_types, *game.validate_types(inside)]))
     if text in GRIDS:
         corners = zip(game.type_box.lo.tolist(), game.type_box.hi.tolist(), strict=True)
         steps = GRIDS[text] - 1
@@ -97,27 +100,31 @@ def parse_types(text: str, policy: OperatorPolicy) -> list[tuple[float, ...]]:
     return game.validate_types(types)
 
 
-def evaluate_policy(
-    policy: OperatorPolicy,
+def solve_tests(
+    game: Game,
     types: Sequence[tuple[float, ...]],
+    starts: int,
+    seed: int,
     cache: Path,
     workers: int | None,
     results: Results,
-    *,
-    starts: int,
-    seed: int,
-    clearance: float,
-    dt: float,
-) -> list[TypeRow]:
-    """Solve the test starts where the cache lacks them, roll out, and put the table into the results."""
-    check_evaluation(policy.game, starts, clearance, dt)
+) -> list[Extremal]:
+    """Labels of the test starts of every type, from the cache or solved."""
     requests = [Request(theta, starts, seed, "test") for theta in types]
-    labels, seconds = labels_for(policy.game, requests, cache, workers=workers, progress=label_progress())
+    labels, seconds = labels_for(game, requests, cache, workers=workers, progress=label_progress())
     results.time("test_labels", seconds)
+    results.update(test_seed=seed)
+    return labels
+
+
+def evaluate_policy(
+    policy: OperatorPolicy, labels: Sequence[Extremal], results: Results, clearance: float, dt: float
+) -> list[TypeRow]:
+    """Roll out from the starts of the labels, put the table into the results and draw an episode."""
     began = time.perf_counter()
     table = collision_table(policy.game, policy, labels, policy.operator.seen_types, clearance, dt)
     results.time("evaluation", time.perf_counter() - began)
-    results.update(clearance=clearance, dt=dt, test_seed=seed, table=[row._asdict() for row in table])
+    results.update(clearance=clearance, dt=dt, table=[row._asdict() for row in table])
     draw(policy, labels[0], results.path.parent / "rollout.png", dt)
     return table
 
@@ -133,10 +140,14 @@ def draw(policy: OperatorPolicy, found: Extremal, path: Path, dt: float, episode
         log.info("No picture: %s", error)
 
 
-def check_evaluation(game: Game, starts: int, clearance: float, dt: float) -> None:
-    """Raise ValueError for sizes that make no evaluation of the game."""
-    if starts < 1:
-        raise ValueError(f"starts must be at least 1 per type; got {starts}.")
-    if not (math.isfinite(clearance) and clearance >= 0):
-        raise ValueError(f"clearance must be a finite distance of at least 0 m; got {clearance}.")
-    control_steps(game, dt)
+def check_evaluation(game: Game, settings: DictConfig) -> None:
+    """Raise ValueError for entries that make no evaluation of the game."""
+    for name, least in (("starts", 1), ("seed", 0), ("workers", 1)):
+        value = settings.get(name)
+        if value is not None and not (isinstance(value, int) and value >= least):
+            raise ValueError(f"{name} must be a whole number of at least {least}; got {value!r}.")
+    for name in ("clearance", "dt"):
+        value = settings[name]
+        if not (isinstance(value, (int, float)) and math.isfinite(value) and value >= 0):
+            raise ValueError(f"{name} must be a finite number of at least 0; got {value!r}.")
+    control_steps(game, settings.dt)

@@ -72,16 +72,19 @@ def wandb_mode(choice: str) -> str:
     """Resolve "auto": online with a key and a reachable server, otherwise offline, said in one line.
 
     Raises:
-        ValueError: unknown mode.
+        ValueError: unknown mode, or "online" without a key.
     """
     known = ("auto", "disabled", "offline", "online")
     if choice not in known:
         raise ValueError(f"logger.mode must be one of {', '.join(known)}; got {choice!r}.")
     choice = os.environ.get("WANDB_MODE", choice) if choice == "auto" else choice
+    has_key = bool(os.environ.get("WANDB_API_KEY") or wandb.api.api_key)
+    if choice == "online" and not has_key:
+        raise ValueError("W&B has no API key to run online: `wandb login`, set WANDB_API_KEY, or use logger.mode=auto.")
     if choice != "auto":
         return choice
     settings = wandb.Settings()
-    if not (os.environ.get("WANDB_API_KEY") or wandb.api.api_key):
+    if not has_key:
         log.info("W&B runs offline: no API key. `wandb login` or WANDB_API_KEY makes it online.")
         return "offline"
     if not _reachable(settings.base_url):

@@ -5,9 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import os
 import platform
-import tempfile
 from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
@@ -16,6 +14,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 import hno
+from hno.data.store import replace_whole
 
 SCHEMA = 1
 """Version of results.json."""
@@ -75,15 +74,6 @@ class Results:
         self.write()
 
     def write(self) -> None:
-        """Write under a temporary name, then rename into place."""
+        """Write the file whole."""
         text = json.dumps(finite(self.content), indent=2, allow_nan=False)
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(dir=self.path.parent, prefix=".results.")
-        try:
-            with os.fdopen(handle, "w") as file:
-                file.write(text + "\n")
-            Path(temporary).chmod(0o644)
-            Path(temporary).replace(self.path)
-        except BaseException:
-            Path(temporary).unlink(missing_ok=True)
-            raise
+        replace_whole(self.path, lambda draft: draft.write_text(text + "\n"))

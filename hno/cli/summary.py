@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import logging
 import sys
+import traceback
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from lightning.fabric.utilities.exceptions import MisconfigurationException
 from rich.console import Console
 from rich.table import Table
+
+import hno
+from hno.registry import UnknownNameError
 
 log = logging.getLogger(__name__)
 
@@ -76,6 +81,9 @@ def verdict(table: Sequence[Mapping[str, Any]]) -> str:
 
 
 def report(error: Exception) -> None:
-    """Log what went wrong: one message for errors that name their remedy, a traceback for surprises."""
-    expected = isinstance(error, (ValueError, KeyError, OSError, RuntimeError))
+    """Log what went wrong: one message for errors that were raised on purpose, a traceback for surprises."""
+    frames = traceback.extract_tb(error.__traceback__)
+    ours = bool(frames) and Path(frames[-1].filename).is_relative_to(Path(hno.__file__).parent)
+    meant = ours and isinstance(error, (ValueError, RuntimeError, UnknownNameError))
+    expected = meant or isinstance(error, (OSError, MisconfigurationException))
     log.error("%s", error, exc_info=None if expected else error)

@@ -15,7 +15,7 @@ from omegaconf import DictConfig
 
 from hno.cli.build import build_data, build_game, build_operator, build_trainer, check_numbers
 from hno.cli.config import run_command
-from hno.cli.evaluate import check_evaluation, evaluate_policy
+from hno.cli.evaluate import check_evaluation, evaluate_policy, solve_tests
 from hno.cli.logs import label_progress, send_lightning_to_hydra
 from hno.cli.results import Results, config_hash
 from hno.cli.summary import report, show
@@ -71,10 +71,10 @@ def _run(config: DictConfig, folder: Path, results: Results) -> None:
     game = build_game(config)
     operator = build_operator(config, game)
     data = build_data(config, operator, label_progress())
-    operator.seen_types = data.type_list
+    operator.seen_types, operator.config_hash = data.type_list, results.content["config_hash"]
     types = list(dict.fromkeys(operator.seen_types + game.validate_types(config.evaluation.types)))
-    settings = {name: config.evaluation[name] for name in ("starts", "seed", "clearance", "dt")}
-    check_evaluation(game, settings["starts"], settings["clearance"], settings["dt"])
+    settings = config.evaluation
+    check_evaluation(game, settings)
     trainer = build_trainer(config, folder)
     if config.resume is not None:
         check_resumable(config.resume, operator)
@@ -82,6 +82,7 @@ def _run(config: DictConfig, folder: Path, results: Results) -> None:
     data.prepare_data()
     data.setup("fit")
     results.time("labels", data.label_seconds)
+    test = solve_tests(game, types, settings.starts, settings.seed, data.cache, config.data.workers, results)
     if config.loss.scaled:
         operator.set_scales(Scales(*data.label_scales()))
 
@@ -90,11 +91,12 @@ def _run(config: DictConfig, folder: Path, results: Results) -> None:
     # The callback saves at multiples of trainer.validate_every, which the last step need not be.
     trainer.save_checkpoint(folder / "last.ckpt", weights_only=False)
     results.time("training", time.perf_counter() - began)
-    metrics = {name: float(value) for name, value in trainer.callback_metrics.items()}
+    metrics = {name: float(value) for name, value in trainer.callback_metrics.items() if name.startswith("loss/")}
+    metrics |= trainer.validate(operator, datamodule=data, verbose=False)[0]
     results.update(steps=trainer.global_step, checkpoint="last.ckpt", metrics=metrics)
 
     policy = load_policy(folder / "last.ckpt")
-    table = evaluate_policy(policy, types, data.cache, config.data.workers, results, **settings)
+    table = evaluate_policy(policy, test, results, settings.clearance, settings.dt)
     for logger in trainer.loggers:
         logger.log_metrics(totals(table), step=trainer.global_step)
     results.update(status="finished")

@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -42,14 +42,27 @@ def write_labels(path: Path, labels: Extremal, provenance: Mapping[str, Any]) ->
     """
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in labels._asdict().items()}
     header = {"format": FORMAT, "sha256": _digest(tensors), "provenance": dict(provenance)}
+    text = canonical_json(header)
+    replace_whole(path, lambda draft: safetensors.torch.save_file(tensors, draft, metadata={KEY: text}))
+
+
+def replace_whole(path: Path, write: Callable[[Path], object]) -> None:
+    """Write a file under a temporary name and rename it into place, readable by everyone; nothing half-written stays.
+
+    Args:
+        path: the file; its folder is made where it is missing.
+        write: fills the file at the path that it gets.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     os.close(handle)
+    draft = Path(name)
     try:
-        safetensors.torch.save_file(tensors, temporary, metadata={KEY: canonical_json(header)})
-        Path(temporary).replace(path)
+        write(draft)
+        draft.chmod(0o644)
+        draft.replace(path)
     except BaseException:
-        Path(temporary).unlink(missing_ok=True)
+        draft.unlink(missing_ok=True)
         raise
 
 

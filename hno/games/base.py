@@ -79,7 +79,7 @@ class Game(nn.Module, abc.ABC):
     Methods accept any leading batch shape and both float32 and float64.
     """
 
-    constants: Mapping[str, float] = MappingProxyType({})
+    constants: Mapping[str, float | Sequence[float]] = MappingProxyType({})
     """Constructor arguments that differ from the defaults."""
     horizon: float
     """Length of the game, s."""

@@ -244,6 +244,9 @@ def _check_penalty(game: Game) -> None:
 
 
 def _check_fingerprint(game: Game) -> None:
-    prints = {game.fingerprint(), game.fingerprint(), copy.deepcopy(game).fingerprint()}
+    prints = {game.fingerprint()}
+    point = _points(game, (2,), torch.float64)
+    game.constraint(point.x, point.theta), game.dynamics(point.x, point.u), game.terminal_value(point.x)
+    prints |= {game.fingerprint(), copy.deepcopy(game).fingerprint()}
     remedy = "Methods must be pure functions of their arguments: no random numbers, clock or counters."
     _require(len(prints) == 1, "one fingerprint for one game", sorted(prints), remedy)

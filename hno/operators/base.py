@@ -64,6 +64,7 @@ class ValueOperator(L.LightningModule, abc.ABC):
         super().__init__()
         self.options = {"activation": activation, "width": width, "depth": depth}
         self.seen_types: list[tuple[float, ...]] = []
+        self.config_hash = ""
         self.game = game
         self.optimizer = optimizer
         self.norm, self.scaled = Norm(norm), scaled
@@ -174,6 +175,7 @@ class ValueOperator(L.LightningModule, abc.ABC):
             "fingerprint": self.game.fingerprint(),
             "options": self.options,
             "seen_types": self.seen_types,
+            "config_hash": self.config_hash,
         }
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -33,12 +34,16 @@ def make_optimizer(name: str, steps: int, lr: float, schedule: str, final_lr: fl
         options: further arguments of the optimiser.
 
     Raises:
-        UnknownNameError: unknown optimiser or schedule.
+        UnknownNameError: unknown optimiser, schedule or option.
     """
     if name not in OPTIMIZERS:
         raise UnknownNameError(unknown_name("optimizer", name, sorted(OPTIMIZERS)))
     if schedule not in SCHEDULES:
         raise UnknownNameError(unknown_name("schedule", schedule, list(SCHEDULES)))
+    known = sorted(set(inspect.signature(OPTIMIZERS[name]).parameters) - {"params", "lr", "kwargs"})
+    for option in options:
+        if option not in known:
+            raise UnknownNameError(unknown_name(f"option of {name}", option, known))
 
     def build(parameters: Iterable[nn.Parameter]) -> dict[str, Any]:
         optimizer = OPTIMIZERS[name](parameters, lr=lr, **options)

@@ -137,7 +137,7 @@ def own_cache(labels: Callable[..., Extremal], cache: Path, tmp_path: Path) -> P
 @pytest.mark.parametrize("split", ["train", "test"])
 @pytest.mark.parametrize("damage", ["truncated", "flipped"])
 def test_damaged_label_file(command: Command, own_cache: Path, split: str, damage: str) -> None:
-    (path,) = own_cache.rglob(f"1-1_{split}*_n4_*.safetensors")
+    (path,) = own_cache.rglob(f"NarrowRoad/1-1_{split}*_n4_*.safetensors")
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 1
     path.write_bytes(content[:-100] if damage == "truncated" else content)

@@ -5,8 +5,10 @@ from pathlib import Path
 
 import pytest
 import torch
+from omegaconf import OmegaConf
 
 import hno
+from hno.cli.config import config_dir
 from hno.cli.evaluate import parse_types
 from hno.games.base import ExtrapolationWarning
 from tests.cli.conftest import SMOKE, Command, refused
@@ -45,7 +47,8 @@ def test_named_grids_span_the_types_of_the_game(random_checkpoint: Path, name: s
 
 
 def test_default_types_are_the_seen_ones_and_four_unseen(random_checkpoint: Path) -> None:
-    types = parse_types("default", hno.load_policy(random_checkpoint))
+    unseen = OmegaConf.load(config_dir() / "evaluate.yaml").unseen
+    types = parse_types("default", hno.load_policy(random_checkpoint), unseen)
     assert types == [(1.0, 1.0), (1.0, 2.0), (2.0, 2.0), (2.0, 4.0), (4.0, 5.0)]
 
 

@@ -85,8 +85,14 @@ def test_unknown_mode(command: Command) -> None:
 
 
 @pytest.mark.parametrize("mode", ["disabled", "offline", "online"])
-def test_a_chosen_mode_is_taken(mode: str) -> None:
+def test_a_chosen_mode_is_taken(mode: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("WANDB_API_KEY", "0" * 40)
     assert wandb_mode(mode) == mode
+
+
+def test_online_needs_a_key() -> None:
+    with pytest.raises(ValueError, match="no API key"):
+        wandb_mode("online")
 
 
 def test_without_a_key_offline_and_one_line(caplog: pytest.LogCaptureFixture) -> None:

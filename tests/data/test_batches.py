@@ -177,3 +177,12 @@ def test_batches_do_not_follow_the_game_elsewhere(make_data: MakeData) -> None:
 def test_impossible_settings_are_refused(make_data: MakeData, changes: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make_data(**changes)
+
+
+def test_scales_stay_positive_where_no_value_depends_on_a_state(make_data: MakeData) -> None:
+    data = make_data()
+    data.train_rows.labels.costate[..., 2] = 0
+    value, costate = data.label_scales()
+    width = data.game.state_box.width[:, 2]
+    torch.testing.assert_close(costate[..., 2], (1e-3 * value / width).expand(2, 2))
+    assert bool((costate > 0).all())

@@ -224,3 +224,17 @@ def test_a_drone_is_steered_by_its_own_angles_alone():
     rate = game.dynamics(torch.zeros(2, 6, dtype=torch.float64), u)
     assert rate[0].abs().max() < 1e-6
     assert rate[1, 4].item() == pytest.approx(-G * math.tan(0.02), rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("constants", "message"),
+    [({"radius": float("nan")}, "finite"), ({"radius": "abc"}, "finite"), ({"horizon": -1.0}, "positive")],
+)
+def test_impossible_constants_are_refused(constants, message):
+    with pytest.raises(ValueError, match=message):
+        make("narrow_road", **constants)
+
+
+def test_an_unknown_constant_names_the_known_ones():
+    with pytest.raises(KeyError, match="Did you mean 'radius'"):
+        make("narrow_road", raduis=1.0)

@@ -12,6 +12,7 @@ from torch import Tensor
 
 import hno
 from hno.games import make
+from hno.games.base import ExtrapolationWarning
 from hno.operators import operators
 from hno.operators.checkpoint import CheckpointError, OperatorPolicy, check_resumable, load_operator, read_checkpoint
 from hno.registry import UnknownNameError
@@ -234,3 +235,46 @@ def test_policy_works_where_gradients_are_switched_off(save: Save) -> None:
     points = random_points(policy.game)
     with torch.no_grad():
         assert torch.equal(policy(*points), policy(*points))
+
+
+def test_policy_works_in_inference_mode(save: Save) -> None:
+    policy = hno.load_policy(save())
+    points = random_points(policy.game)
+    with torch.inference_mode():
+        inside = policy(*(part.clone() for part in points))
+    torch.testing.assert_close(inside, policy(*points), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("which", ["tau", "x", "theta"])
+def test_policy_refuses_entries_that_are_not_finite(save: Save, which: str) -> None:
+    policy = hno.load_policy(save())
+    points = random_points(policy.game)
+    broken = getattr(points, which).clone()
+    broken.view(-1)[-1] = torch.nan
+    with pytest.raises(ValueError, match="finite"):
+        policy(*points._replace(**{which: broken}))
+
+
+def test_policy_warns_outside_the_types(save: Save) -> None:
+    policy = hno.load_policy(save())
+    points = random_points(policy.game)
+    with pytest.warns(ExtrapolationWarning):
+        policy(*points._replace(theta=points.theta + 9))
+
+
+@pytest.mark.parametrize("game", GAMES)
+def test_fingerprint_is_the_same_in_every_dtype(game: str) -> None:
+    assert make(game).double().fingerprint() == make(game).fingerprint()
+
+
+def test_fingerprint_tells_sensors_apart() -> None:
+    changed = make("narrow_road")
+    changed.first_sensor = 0.5
+    assert changed.fingerprint() != make("narrow_road").fingerprint()
+
+
+def test_resuming_asks_for_the_same_configuration(make_operator: MakeOperator, save: Save) -> None:
+    path, other = save(), make_operator()
+    other.config_hash = "another"
+    with pytest.raises(CheckpointError, match="config_hash"):
+        check_resumable(path, other)

@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 import torch
+from torch import Tensor
 
 from hno.games import make
 from hno.operators import ValueOperator, operators
@@ -23,10 +24,18 @@ def quiet(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ValueOperator, "log_dict", lambda *args, **kwargs: None)
 
 
+def in_contact(x: Tensor) -> Tensor:
+    """Joint states of the narrow road in which the cars are side by side, so that the penalty feels the radius."""
+    x = x.clone()
+    x[:, 1, 0] = 70 - x[:, 0, 0]
+    return x
+
+
 def random_batch(operator: ValueOperator, size: int = 8) -> Batch:
     game = operator.game
     points = {name: random_points(game, size, seed) for seed, name in enumerate(STREAMS)}
     points["terminal"] = points["terminal"]._replace(tau=torch.zeros_like(points["terminal"].tau))
+    points["interior"] = points["interior"]._replace(x=in_contact(points["interior"].x))
     value, costate = torch.randn(size, 2), torch.randn(size, 2, 2, game.state_dim)
     labels = Labels(40 * value.to(points["bvp"].x), 3 * costate.to(points["bvp"].x))
     return {name: Sample(at, labels if name == "bvp" else None) for name, at in points.items()}
@@ -74,10 +83,7 @@ def test_residual_takes_the_theta_of_its_own_row(make_operator: MakeOperator) ->
     operator = make_operator(weights={"residual": 1.0}).double()
     batch = {"interior": random_batch(operator)["interior"]}
     at = batch["interior"].points
-    close = at.x.clone()
-    close[:, 1, 0] = 70 - close[:, 0, 0]
-    batch["interior"] = Sample(at._replace(x=close))
-    rolled = {"interior": Sample(at._replace(x=close, theta=at.theta.roll(1, 0)))}
+    rolled = {"interior": Sample(at._replace(theta=at.theta.roll(1, 0)))}
     assert operator.training_step(batch, 0).item() != pytest.approx(operator.training_step(rolled, 0).item(), rel=1e-6)
 
 
@@ -194,3 +200,9 @@ def test_every_optimizer_lowers_a_loss(make_operator: MakeOperator, name: str) -
 def test_norms_are_refused_by_name() -> None:
     with pytest.raises(ValueError, match="huber, l1, l2"):
         operators.get("hno")(make("drone"), norm="l3")
+
+
+@pytest.mark.parametrize("name", ["adam", "adamw", "soap"])
+def test_unknown_optimizer_options_are_refused_before_training(name: str) -> None:
+    with pytest.raises(KeyError, match="No option of"):
+        make_optimizer(name, steps=3, lr=1e-3, schedule="constant", final_lr=0.0, foo=1)
