@@ -8,6 +8,9 @@ import pytest
 import torch
 
 from hno.data import datamodule
+from hno.data.generate import label_path
+from hno.games import make
+from hno.pontryagin import Solver
 from hno.types import Extremal
 from tests.cli.conftest import SMOKE, Command, refused
 from tests.conftest import TEST, TRAIN
@@ -129,15 +132,18 @@ def test_unwritable_label_folder(command: Command) -> None:
 @pytest.fixture
 def own_cache(labels: Callable[..., Extremal], cache: Path, tmp_path: Path) -> Path:
     """A copy of the labels that a smoke run needs."""
-    labels("narrow_road", TRAIN)
-    labels("narrow_road", TEST)
-    return Path(shutil.copytree(cache / "NarrowRoad", tmp_path / "labels" / "NarrowRoad")).parent
+    folder = tmp_path / "labels" / "NarrowRoad"
+    folder.mkdir(parents=True)
+    for request in (TRAIN, TEST):
+        labels("narrow_road", request)
+        shutil.copy(label_path(make("narrow_road"), request, cache, Solver()), folder)
+    return folder.parent
 
 
 @pytest.mark.parametrize("split", ["train", "test"])
 @pytest.mark.parametrize("damage", ["truncated", "flipped"])
 def test_damaged_label_file(command: Command, own_cache: Path, split: str, damage: str) -> None:
-    (path,) = own_cache.rglob(f"NarrowRoad/1-1_{split}*_n4_*.safetensors")
+    (path,) = own_cache.rglob(f"1-1_{split}*_n4_*.safetensors")
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 1
     path.write_bytes(content[:-100] if damage == "truncated" else content)

@@ -68,8 +68,7 @@ def test_band_is_that_of_the_theta_of_each_row(make_data: MakeData, name: str) -
     points = data.batch(9)["interior"].points
     gap = radius(name, points.theta) - distance(name, points.x)
     reached, small = (gap > -2.6) & (gap < 1.4), points.theta[:, 0] == 1
-    centres = [float(gap[reached & mask].median()) for mask in (small, ~small)]
-    assert centres == pytest.approx([-0.6, -0.6], abs=0.25)
+    assert abs(float(gap[reached & small].median() - gap[reached & ~small].median())) < 0.3
 
 
 def test_band_spreads_over_its_width(make_data: MakeData) -> None:
