@@ -15,6 +15,7 @@ from hno.data.curriculum import Curriculum
 from hno.data.generate import Progress, default_cache
 from hno.evaluation.callbacks import StopOnDivergence, checkpoints
 from hno.games import Game, make
+from hno.losses import losses
 from hno.operators import ValueOperator, operators
 from hno.operators.optimizers import make_optimizer
 
@@ -63,6 +64,8 @@ def build_operator(config: DictConfig, game: Game) -> ValueOperator:
     options = plain(config.operator)
     cls = operators.get(options.pop("name"))
     optimizer = make_optimizer(steps=config.trainer.max_steps, **plain(config.optimizer))
+    for term in config.loss.weights:
+        losses.get(term)  # refuses a weight of a term that does not exist
     return cls(
         game,
         activation=config.activation.name,

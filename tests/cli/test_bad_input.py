@@ -181,3 +181,9 @@ def test_every_label_failed(command: Command, monkeypatch: pytest.MonkeyPatch, l
     run = command("train", *SMOKE)
     refused(run, "None of 3 boundary value problems of NarrowRoad converged")
     assert run.results["reason"].startswith("NoLabelsError")
+
+
+@pytest.mark.usefixtures("no_labels")
+def test_a_weight_of_an_unknown_term(command: Command) -> None:
+    run = command("train", *SMOKE, "+loss.weights.residuals=1.0")
+    refused(run, "No loss named 'residuals'", "Did you mean 'residual'")
