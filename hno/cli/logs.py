@@ -116,9 +116,27 @@ def label_progress(every: float = 10.0) -> Progress:
     return say
 
 
+class StepBar(RichProgressBar):
+    """A live bar over the steps of the run; epochs mean nothing here."""
+
+    @property
+    def total_train_batches(self) -> int:
+        """Steps of the run."""
+        return self.trainer.max_steps
+
+    def _get_train_description(self, current_epoch: int) -> str:
+        return "training"
+
+    def get_metrics(
+        self, trainer: L.Trainer, pl_module: L.LightningModule
+    ) -> dict[str, int | str | float | dict[str, float]]:
+        """Losses, without the logger's version."""
+        return {name: value for name, value in super().get_metrics(trainer, pl_module).items() if name != "v_num"}
+
+
 def progress_bar() -> ProgressBar | None:
     """A live bar on a terminal, nothing elsewhere."""
-    return RichProgressBar() if sys.stdout.isatty() else None
+    return StepBar() if sys.stdout.isatty() else None
 
 
 class StepLines(L.Callback):
