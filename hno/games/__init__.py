@@ -4,7 +4,8 @@ import inspect
 import math
 from collections.abc import Sequence
 
-from hno.games.base import Box, ControlAffineGame, Game, games
+from hno.games.base import ControlAffineGame, Game, games
+from hno.games.box import Box
 from hno.games.collision import CollisionAvoidance
 from hno.registry import UnknownNameError, unknown_name
 

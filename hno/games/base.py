@@ -13,6 +13,7 @@ from types import MappingProxyType
 import torch
 from torch import Tensor, nn
 
+from hno.games.box import Box
 from hno.registry import Registry
 
 games: Registry[Game] = Registry("game", "hno.games")
@@ -20,53 +21,6 @@ games: Registry[Game] = Registry("game", "hno.games")
 
 class ExtrapolationWarning(UserWarning):
     """Player types outside the range that a game is made for."""
-
-
-class Box(nn.Module):
-    """The axis-aligned box `lo <= x <= hi`.
-
-    Args:
-        lo: lower corner, any shape.
-        hi: upper corner, the same shape, nowhere below `lo`.
-    """
-
-    lo: Tensor
-    hi: Tensor
-
-    def __init__(self, lo: Sequence[object] | Tensor, hi: Sequence[object] | Tensor) -> None:
-        super().__init__()
-        self.register_buffer("lo", torch.as_tensor(lo, dtype=torch.get_default_dtype()))
-        self.register_buffer("hi", torch.as_tensor(hi, dtype=torch.get_default_dtype()))
-        if self.lo.shape != self.hi.shape or bool((self.lo > self.hi).any()):
-            raise ValueError(f"A box needs lo <= hi of equal shape; got lo {self.lo.tolist()}, hi {self.hi.tolist()}.")
-
-    @property
-    def width(self) -> Tensor:
-        """Edge lengths."""
-        return self.hi - self.lo
-
-    def scale(self, x: Tensor) -> Tensor:
-        """Map the box to [-1, 1], shape (..., *box)."""
-        return 2 * (x - self.lo) / self.width - 1
-
-    def clamp(self, x: Tensor) -> Tensor:
-        """The nearest point of the box."""
-        return x.clamp(self.lo, self.hi)
-
-    def contains(self, x: Tensor) -> Tensor:
-        """Whether each point lies in the box, shape (...)."""
-        inside = (self.lo <= x) & (x <= self.hi)
-        return inside.flatten(inside.dim() - self.lo.dim()).all(-1)
-
-    def sample(self, size: int, generator: torch.Generator) -> Tensor:
-        """Uniform points, shape (size, *box)."""
-        unit = torch.rand((size, *self.lo.shape), generator=generator, dtype=self.lo.dtype, device=generator.device)
-        return self.lo + unit.to(self.lo) * self.width
-
-    def widened(self, factor: float) -> Box:
-        """The box with `factor` times the width around the same centre."""
-        centre, half = (self.lo + self.hi) / 2, factor * self.width / 2
-        return Box(centre - half, centre + half)
 
 
 class Game(nn.Module, abc.ABC):
@@ -175,10 +129,7 @@ class Game(nn.Module, abc.ABC):
             entries = _numbers(theta)
             if len(entries) != self.players or not all(map(math.isfinite, entries)):
                 raise ValueError(f"theta must be {self.players} finite numbers, one per player; got {theta!r}.")
-            if not bool(self.type_box.contains(torch.tensor(entries, device=self.type_box.lo.device))):
-                lo, hi = self.type_box.lo.tolist(), self.type_box.hi.tolist()
-                message = f"theta = {entries} lies outside the types {lo} to {hi} of the game: results extrapolate."
-                warnings.warn(message, ExtrapolationWarning, stacklevel=2)
+            self.check_theta(torch.tensor(entries, device=self.type_box.lo.device))
             checked.append(entries)
         return checked
 
@@ -192,7 +143,8 @@ class Game(nn.Module, abc.ABC):
             raise ValueError(f"theta must be finite; got {theta.tolist()}.")
         if not bool(self.type_box.contains(theta).all()):
             lo, hi = self.type_box.lo.tolist(), self.type_box.hi.tolist()
-            message = f"theta lies outside the types {lo} to {hi} of the game: results extrapolate."
+            given = f" = {tuple(theta.tolist())}" if theta.dim() == 1 else ""
+            message = f"theta{given} lies outside the types {lo} to {hi} of the game: results extrapolate."
             warnings.warn(message, ExtrapolationWarning, stacklevel=3)
 
     def fingerprint(self) -> str:

@@ -7,7 +7,8 @@ from typing import final
 import torch
 from torch import Tensor
 
-from hno.games.base import Box, games
+from hno.games.base import games
+from hno.games.box import Box
 from hno.games.collision import CollisionAvoidance
 from hno.games.kinematics import GRAVITY, double_integrator_drift
 
