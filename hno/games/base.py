@@ -206,7 +206,7 @@ class ControlAffineGame(Game):
 def _numbers(entries: object) -> tuple[float, ...]:
     """Entries of a sequence as floats; none if it is no sequence of numbers."""
     try:
-        return tuple(float(entry) for entry in entries)  # type: ignore[attr-defined]
+        return tuple(float(entry) for entry in entries)  # type: ignore[attr-defined]  # that is what is tried
     except (TypeError, ValueError):
         return ()
 
