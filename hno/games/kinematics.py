@@ -33,7 +33,6 @@ def separation(positions: Tensor, softness: float = 1e-6) -> Tensor:
         positions: points in one common frame, m.
         softness: rounds the tip of the cone, m, so that every derivative is finite where players touch.
     """
-    offset = positions.unsqueeze(-2) - positions.unsqueeze(-3)
-    distance = (offset.square().sum(-1) + softness**2).sqrt()
-    alone = torch.eye(positions.shape[-2], dtype=torch.bool, device=positions.device)
-    return distance.masked_fill(alone, torch.inf).amin(-1)
+    others = (positions.roll(shift, -2) for shift in range(1, positions.shape[-2]))
+    squares = torch.stack([(positions - other).square().sum(-1) for other in others]).amin(0)
+    return (squares + softness**2).sqrt()

@@ -1,30 +1,30 @@
-"""Batched differential dynamic programming on the joint problem, with controls clamped to their box."""
+"""Batched differential dynamic programming over held controls that are clamped to their box."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from hno.pontryagin.joint import Expansion, JointProblem
+from hno.pontryagin.held_controls import Expansion, HeldControls
 
 STEP_LENGTHS = (1.0, 0.5, 0.2, 0.05)
-"""Step lengths that are tried side by side."""
+"""Step lengths in the order in which they are tried."""
 
 
 def descend(
-    problem: JointProblem, start: Tensor, v: Tensor, iterations: int, tolerance: float
+    problem: HeldControls, start: Tensor, v: Tensor, iterations: int, tolerance: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Lower the joint cost of every row.
+    """Lower the cost of every row.
 
     Args:
-        problem: the joint problem of R rows.
+        problem: a problem of R rows.
         start: initial states, (R, P, n).
         v: scaled controls to start from, (R, N, P, m).
         iterations: iteration budget.
         tolerance: relative decrease below which a row is left alone.
 
     Returns:
-        States (R, N + 1, P, n), scaled controls (R, N, P, m) and joint costs (R,).
+        States (R, N + 1, P, n), scaled controls (R, N, P, m) and costs (R,).
     """
     v = v.clone()
     x = problem.rollout(start, v)
@@ -33,12 +33,11 @@ def descend(
     active = torch.arange(len(cost), device=cost.device)
     for _ in range(iterations):
         part = problem.rows(active)
-        policy = _backward(part.expand(x[active], v[active]), v[active], damping[active])
-        moved_x, moved_v, reached = _forward(part, x[active], v[active], policy)
+        policy = _backward(part, part.expand(x[active], v[active]), v[active], damping[active])
+        moved_x, moved_v, reached = _forward(part, x[active], v[active], cost[active], policy)
         gain = cost[active] - reached
         better = gain > 0
-        rows = active[better]
-        x[rows], v[rows], cost[rows] = moved_x[better], moved_v[better], reached[better]
+        x[active], v[active], cost[active] = moved_x, moved_v, reached
         damping[active] *= torch.where(better, 0.3, 10.0)
         going = torch.where(better, gain > tolerance * cost[active].abs(), damping[active] < 1e6)
         active = active[going]
@@ -47,52 +46,60 @@ def descend(
     return x, v, cost
 
 
-def _backward(model: Expansion, v: Tensor, damping: Tensor) -> tuple[Tensor, Tensor]:
+def _backward(problem: HeldControls, model: Expansion, v: Tensor, damping: Tensor) -> tuple[Tensor, Tensor]:
     """Open-loop steps (R, N, M) and feedback gains (R, N, M, D) that minimise the model."""
-    slope, curve = model.end_gradient, model.end_hessian
-    states = slope.shape[-1]
-    eye = torch.eye(model.gradient.shape[-1] - states, dtype=v.dtype, device=v.device)
-    bound, flat = v.abs() >= 1, v.flatten(-2)
+    slope, curve = model.gradient[:, -1], model.hessian[:, -1]
+    states, controls = model.control_matrix.shape[-2:]
+    eye = torch.eye(controls, dtype=v.dtype, device=v.device)
+    flat = v.flatten(-2)
+    bound = (flat.abs() >= 1).to(v.dtype) * flat
+    acts = problem.acts.repeat_interleave(v.shape[-1], -1)
     steps, gains = [], []
-    for k in reversed(range(model.gradient.shape[1])):
-        move = model.dynamics[:, k]
-        gradient = model.gradient[:, k] + (slope.unsqueeze(-2) @ move).squeeze(-2)
-        hessian = model.hessian[:, k] + move.mT @ curve @ move
-        control_gradient = gradient[:, states:]
-        held = bound[:, k].flatten(-2) & (control_gradient * flat[:, k] < 0)
-        free = (~held).to(v.dtype).unsqueeze(-1)
-        damped = hessian[:, states:, states:] * free * free.mT + eye * (damping[:, None, None] + 1 - free)
-        sides = torch.cat([hessian[:, states:, :states], control_gradient.unsqueeze(-1)], -1)
+    for k in reversed(range(problem.steps)):
+        drift, push = model.state_matrix[:, k], model.control_matrix[:, k]
+        ahead = push.mT @ curve
+        sides = torch.cat([ahead @ drift, _times(push.mT, slope) + model.control_gradient[:, k].unsqueeze(-1)], -1)
+        free = ((sides[..., -1] * bound[:, k] >= 0) * acts).unsqueeze(-1)
+        hessian = model.control_hessian[:, k] + ahead @ push
+        damped = hessian * free * free.mT + eye * (damping[:, None, None] + 1 - free)
         solved = -torch.linalg.solve_ex(damped, sides * free).result
-        gain, step = solved[..., :states], solved[..., states]
-        closed = hessian[:, :states] + gain.mT @ hessian[:, states:]
-        curve = closed[..., :states] + closed[..., states:] @ gain
+        # with the policy dv = gain dx + step the model stays quadratic in dx
+        left = sides[..., :states].mT + solved[..., :states].mT @ hessian
+        slope = model.gradient[:, k] + (
+            _times(drift.mT, slope) + left @ solved[..., states:] + solved[..., :states].mT @ sides[..., states:]
+        ).squeeze(-1)
+        curve = model.hessian[:, k] + drift.mT @ curve @ drift + left @ solved[..., :states]
+        curve = curve + solved[..., :states].mT @ sides[..., :states]
         curve = (curve + curve.mT) / 2
-        slope = gradient[:, :states] + (closed[..., states:] @ step.unsqueeze(-1)).squeeze(-1)
-        slope = slope + (gain.mT @ control_gradient.unsqueeze(-1)).squeeze(-1)
-        steps.append(step)
-        gains.append(gain)
+        steps.append(solved[..., states])
+        gains.append(solved[..., :states])
     return torch.stack(steps[::-1], 1), torch.stack(gains[::-1], 1)
 
 
+def _times(matrix: Tensor, vector: Tensor) -> Tensor:
+    return matrix @ vector.unsqueeze(-1)
+
+
 def _forward(
-    problem: JointProblem, x: Tensor, v: Tensor, policy: tuple[Tensor, Tensor]
+    problem: HeldControls, x: Tensor, v: Tensor, cost: Tensor, policy: tuple[Tensor, Tensor]
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The best of several step lengths for each row: states, scaled controls, cost."""
-    steps, gains = policy
-    lengths = torch.tensor(STEP_LENGTHS, dtype=v.dtype, device=v.device)
-    rows = torch.arange(len(v), device=v.device).repeat(len(lengths))
-    scale = lengths.repeat_interleave(len(v)).unsqueeze(-1)
-    many = problem.rows(rows)
-    state, path, controls = x[rows, 0], [x[rows, 0]], []
-    for k in range(problem.steps):
-        offset = (gains[rows, k] @ (state - x[rows, k]).flatten(-2).unsqueeze(-1)).squeeze(-1)
-        control = v[rows, k] + (scale * steps[rows, k] + offset).unflatten(-1, v.shape[-2:])
-        controls.append(control.clamp(-1, 1))
-        state = problem.advance(state, controls[-1])
-        path.append(state)
-    new_x, new_v = torch.stack(path, 1), torch.stack(controls, 1)
-    cost = many.cost(new_x, new_v).nan_to_num(torch.inf).view(len(lengths), -1)
-    best, which = cost.min(0)
-    pick = which * len(v) + torch.arange(len(v), device=v.device)
-    return new_x[pick], new_v[pick], best
+    """The longest step that lowers the cost of each row, or none: states, scaled controls, cost."""
+    best_x, best_v, best = x.clone(), v.clone(), cost.clone()
+    rows = torch.arange(len(v), device=v.device)
+    for length in STEP_LENGTHS:
+        part, (steps, gains) = problem.rows(rows), (piece[rows] for piece in policy)
+        state, path, controls = x[rows, 0], [x[rows, 0]], []
+        for k in range(problem.steps):
+            change = _times(gains[:, k], (state - x[rows, k]).flatten(-2)).squeeze(-1) + length * steps[:, k]
+            controls.append((v[rows, k] + change.unflatten(-1, v.shape[-2:])).clamp(-1, 1))
+            state = part.advance(k, state, controls[-1])
+            path.append(state)
+        new_x, new_v = torch.stack(path, 1), torch.stack(controls, 1)
+        reached = part.cost(new_x, new_v).nan_to_num(torch.inf)
+        lower = reached < cost[rows]
+        done = rows[lower]
+        best_x[done], best_v[done], best[done] = new_x[lower], new_v[lower], reached[lower]
+        rows = rows[~lower]
+        if len(rows) == 0:
+            break
+    return best_x, best_v, best

@@ -14,7 +14,7 @@ from torch import Tensor
 from hno.games import Game
 from hno.games.base import own_costate
 from hno.pontryagin.adjoint import pmp_rate, terminal_costate
-from hno.pontryagin.joint import JointProblem
+from hno.pontryagin.held_controls import HeldControls
 from hno.pontryagin.mesh import label_times
 from hno.pontryagin.starts import manoeuvres
 from hno.pontryagin.sweep import costates
@@ -82,7 +82,7 @@ def _attempt(game: Game, x0: Tensor, theta: Tensor, t: Tensor, shape: Tensor, to
 
 def _initial_guess(game: Game, x0: Tensor, theta: Tensor, t: Tensor, shape: Tensor) -> tuple[Tensor, Tensor]:
     """States and own costates on the label grid of a manoeuvre around the controls of a player at rest."""
-    problem = JointProblem(game, theta.unsqueeze(0))
+    problem = HeldControls(game, t, theta.unsqueeze(0))
     neutral = problem.scaled(game.best_response(x0, torch.zeros_like(x0)))
     v = (neutral + shape).clamp(-1, 1).unsqueeze(0)
     x, u = problem.rollout(x0.unsqueeze(0), v), problem.control(v)

@@ -13,7 +13,7 @@ from hno.games.base import own_costate
 from hno.pontryagin.collocation import Collocation, Iterate, Newton, newton
 from hno.pontryagin.integrate import runge_kutta
 from hno.pontryagin.mesh import Mesh, graded_mesh, label_times
-from hno.pontryagin.starts import Search, find_starts
+from hno.pontryagin.starts import Search, Starts, find_starts
 from hno.pontryagin.sweep import costates, values
 from hno.types import Extremal, Status
 
@@ -75,7 +75,8 @@ def _first_bad_row(tensor: Tensor) -> int:
 
 def _solve_chunk(game: Game, x0: Tensor, theta: Tensor, settings: Solver) -> Extremal:
     with torch.no_grad():
-        starts = find_starts(game, x0, theta, settings.search)
+        starts = find_starts(copy.deepcopy(game).float(), x0.float(), theta.float(), settings.search)
+        starts = Starts(*(part.double() for part in starts))
         size, kept = starts.cost.shape
         types = theta.repeat_interleave(kept, 0)
         tried = starts.cost.isfinite()

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from hno.games import Game
 from hno.pontryagin.descent import descend
-from hno.pontryagin.joint import JointProblem
+from hno.pontryagin.held_controls import HeldControls
+from hno.pontryagin.mesh import label_times
 
 
 class Search(NamedTuple):
@@ -24,6 +25,10 @@ class Search(NamedTuple):
     """Descent iterations with the margin, and the number of manoeuvres per state that are kept after them."""
     fine_iterations: int = 25
     """Descent iterations without the margin, for the manoeuvres that are kept at last."""
+    coarse: int = 2
+    """Label intervals that share a control while the manoeuvres are sorted out."""
+    points: int = 4
+    """Penalty evaluations in each label interval."""
     tolerance: float = 1e-4
     """Relative decrease at which a descent ends."""
 
@@ -48,17 +53,23 @@ def find_starts(game: Game, start: Tensor, theta: Tensor, search: Search) -> Sta
         theta: player types, (B, P).
         search: settings.
     """
-    shapes = manoeuvres(game, dtype=start.dtype, device=start.device)
+    t = label_times(game, dtype=start.dtype, device=start.device)
+    nodes = torch.arange(0, len(t) - 1, search.coarse, device=start.device)
+    times = torch.cat([t[nodes], t[-1:]])
+    shapes = manoeuvres(game, dtype=start.dtype, device=start.device)[:, nodes]
     size, count = len(start), len(shapes)
     rows = torch.arange(size, device=start.device).repeat_interleave(count)
-    guarded = JointProblem(game, theta[rows], search.margin)
-    v = _best_amplitude(guarded, start[rows], shapes.repeat(size, 1, 1, 1), search.amplitudes)
+    options = {"margin": search.margin, "points": search.points * search.coarse}
+    v = _best_amplitude(
+        HeldControls(game, times, theta[rows], **options), start[rows], shapes.repeat(size, 1, 1, 1), search.amplitudes
+    )
     for iterations, kept in search.rounds:
-        guarded = JointProblem(game, theta[rows], search.margin)
+        guarded = HeldControls(game, times, theta[rows], **options)
         x, v, cost = descend(guarded, start[rows], v, iterations, search.tolerance)
         best = _cheapest(x, cost, size)[1][:, :kept].flatten()
         rows, v = rows[best], v[best]
-    exact = JointProblem(game, theta[rows])
+    exact = HeldControls(game, t, theta[rows], points=search.points)
+    v = v.repeat_interleave(search.coarse, 1)[:, : exact.steps]
     x, v, cost = descend(exact, start[rows], v, search.fine_iterations, search.tolerance)
     cost, order = _cheapest(x, cost, size)
     return Starts(x[order], exact.control(v)[order], cost)
@@ -79,7 +90,7 @@ def manoeuvres(game: Game, *, dtype: torch.dtype, device: torch.device) -> Tenso
     return wave.view(-1, 1, 1) * patterns.unsqueeze(1)
 
 
-def _best_amplitude(problem: JointProblem, start: Tensor, shape: Tensor, amplitudes: tuple[float, ...]) -> Tensor:
+def _best_amplitude(problem: HeldControls, start: Tensor, shape: Tensor, amplitudes: tuple[float, ...]) -> Tensor:
     """The cheapest size of each manoeuvre around the controls of a player at rest, (R, N, P, m)."""
     neutral = problem.scaled(problem.game.best_response(start, torch.zeros_like(start))).unsqueeze(1)
     tried = [(neutral + size * shape).clamp(-1, 1) for size in amplitudes]
