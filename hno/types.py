@@ -64,6 +64,25 @@ class Status(IntEnum):
     """The step budget ran out while the residual was still falling."""
     NOT_FINITE = 3
     """The states left the region where the game's functions are finite."""
+    INACCURATE = 4
+    """Solved on the mesh, but its controls do not lead where its states say."""
+
+    @property
+    def advice(self) -> str:
+        """What it means and what to do about it."""
+        return _ADVICE[self]
+
+
+_ADVICE = {
+    Status.CONVERGED: "the residual is below the tolerance: use it",
+    Status.STALLED: "the residual stopped falling, mostly where controls saturate: try Solver(extra_nodes=120) or more "
+    "starts with Search(rounds=...)",
+    Status.MAX_STEPS: "the residual was still falling: raise Newton(steps=...)",
+    Status.NOT_FINITE: "states or costates grew beyond bounds: check that dynamics and costs are finite around the PDE "
+    "box, with hno.games.testing.check_game",
+    Status.INACCURATE: "solved on the mesh, but its controls do not lead where its states say: raise "
+    "Solver(extra_nodes=...)",
+}
 
 
 class Extremal(NamedTuple):
@@ -90,6 +109,12 @@ class Extremal(NamedTuple):
     """Player types, shape (B, P)."""
     clearance: Tensor
     """Smallest -constraint over players and time, between the nodes too, m for distance constraints, shape (B,)."""
+    reintegration: Tensor
+    """Distance between its end and where its controls lead, in widths of the PDE box, (B,)."""
+    local_gap: Tensor
+    """What each player gains by re-optimising alone, from this trajectory, relative to its cost, (B, P)."""
+    global_gap: Tensor
+    """The same from several manoeuvres; above some 1e-3 the equilibrium is a local one, (B, P)."""
     alternatives: Tensor
     """Sum of values of every start that was tried, NaN where it did not converge, shape (B, starts)."""
 

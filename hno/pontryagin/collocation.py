@@ -32,7 +32,7 @@ class Newton(NamedTuple):
     """Further steps with the derivatives of one step, while they cut the residual to a fifth."""
     halvings: int = 8
     """Step-length halvings before the search counts as stalled."""
-    full_steps: int = 25
+    full_steps: int = 20
     """Budget of undamped steps for a stalled trajectory, from each of two origins."""
 
 
@@ -85,6 +85,21 @@ class Collocation:
         bend = step.unsqueeze(-1) / 8 * (rate[:, :-1] - rate[:, 1:])
         return (z[:, :-1] + z[:, 1:]) / 2 + bend
 
+    def interpolate(self, at: Iterate, share: Tensor) -> Tensor:
+        """The cubic Hermite interpolant at shares (S,) of every interval, (B, K - 1, S, D)."""
+        rate = self.rate(at.z, at.theta)
+        ends = (part[:, nodes, None] for part in (at.z, rate) for nodes in (slice(None, -1), slice(1, None)))
+        return hermite(*ends, at.t.diff(dim=-1)[..., None, None], share.unsqueeze(-1))
+
+    def at_times(self, at: Iterate, t: Tensor) -> Tensor:
+        """The same interpolant at times (B, M) of the mesh's span, (B, M, D)."""
+        left = (torch.searchsorted(at.t.contiguous(), t.contiguous()) - 1).clamp_min(0)
+        rows = torch.arange(len(t), device=t.device).unsqueeze(-1)
+        rate = self.rate(at.z, at.theta)
+        ends = (part[rows, left + next_] for part in (at.z, rate) for next_ in (0, 1))
+        step = at.t[rows, left + 1] - at.t[rows, left]
+        return hermite(*ends, step.unsqueeze(-1), ((t - at.t[rows, left]) / step).unsqueeze(-1))
+
     def defect(self, at: Iterate) -> Tensor:
         """Simpson defect of each interval, (B, K - 1, D)."""
         step = at.t.diff(dim=-1)
@@ -134,6 +149,12 @@ class Collocation:
             flat = at.z[:, -1, : self.half].detach().requires_grad_()
             target = terminal_costate(self.game, flat.unflatten(-1, (self.game.players, -1)), create_graph=True)
             return jacobian_rows(own_costate(target).flatten(-2), flat).movedim(0, -2)
+
+
+def hermite(before: Tensor, after: Tensor, rate: Tensor, rate_after: Tensor, step: Tensor, share: Tensor) -> Tensor:
+    """The cubic with given values and rates at both ends of a step, at a share of it."""
+    chord = before + (3 - 2 * share) * share**2 * (after - before)
+    return chord + step * share * (1 - share) * ((1 - share) * rate - share * rate_after)
 
 
 class Elimination(NamedTuple):
@@ -195,26 +216,48 @@ def _apply(matrix: Tensor, vector: Tensor) -> Tensor:
     return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
 
 
-def newton(equations: Collocation, start: Iterate, settings: Newton) -> tuple[Tensor, Tensor, Tensor]:
-    """Damped Newton, then full steps for what stalled; every trajectory stops on its own.
+class Solved(NamedTuple):
+    """Where Newton ended."""
 
-    Derivatives are first taken in single precision: it is the defect that must be exact. Where controls reach their
-    bounds the equations have kinks. There a residual that must fall at every step stops the search, but full steps
-    carry it through: first from where it stalled, then from the start.
+    z: Tensor
+    """Unknowns, (B, K, D)."""
+    residual: Tensor
+    """Largest scaled residuals, (B,)."""
+    status: Tensor
+    """`Status`, (B,)."""
 
-    Returns:
-        The unknowns (B, K, D), their scaled residual (B,) and `Status` (B,).
+
+def newton(equations: Collocation, start: Iterate, settings: Newton) -> Solved:
+    """Damped Newton; every trajectory stops on its own.
+
+    Derivatives are taken in single precision: it is the defect that must be exact.
     """
     rough = Collocation(copy.deepcopy(equations.game).float())
-    z, residual, status = _damped_steps(equations, rough, start, settings)
-    for origin in (z.clone(), start.z):
-        rows = (status == Status.STALLED).nonzero().squeeze(-1)
+    return _damped_steps(equations, rough, start, settings)
+
+
+def rescue(equations: Collocation, start: Iterate, found: Solved, rows: Tensor, settings: Newton) -> Solved:
+    """Full steps for stalled trajectories, in double precision: first from where they stalled, then from the start.
+
+    Where controls reach their bounds the equations have kinks. There a residual that must fall at every step stops the
+    search, but full steps carry it through.
+
+    Args:
+        equations: the equations.
+        start: where Newton started.
+        found: where it ended.
+        rows: trajectories to rescue, (R,).
+        settings: the budget.
+    """
+    z, residual, status = (part.clone() for part in found)
+    for origin in (found.z, start.z):
+        rows = rows[status[rows] == Status.STALLED]
         if len(rows) == 0:
             break
         reached, size = _full_steps(equations, Iterate(start.t[rows], origin[rows], start.theta[rows]), settings)
         done = size <= settings.tolerance
         z[rows[done]], residual[rows[done]], status[rows[done]] = reached[done], size[done], Status.CONVERGED
-    return z, residual, status
+    return Solved(z, residual, status)
 
 
 def _full_steps(equations: Collocation, at: Iterate, settings: Newton) -> tuple[Tensor, Tensor]:
@@ -236,8 +279,8 @@ def _direction(equations: Collocation, system: Elimination, at: Iterate) -> Tens
 
 def _damped_steps(
     equations: Collocation, rough: Collocation, start: Iterate, settings: Newton
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Newton with a line search: unknowns, residuals and `Status`."""
+) -> Solved:
+    """Newton with a line search."""
     z, residual = start.z.clone(), equations.residual(start)
     status = torch.full_like(residual, Status.MAX_STEPS, dtype=torch.int64)
     for _ in range(settings.steps):
@@ -254,7 +297,7 @@ def _damped_steps(
         _reuse(equations, system, at._replace(z=moved), reached, (~stuck).nonzero().squeeze(-1), settings)
         z[active[~stuck]], residual[active[~stuck]] = moved[~stuck], reached[~stuck]
     status[residual <= settings.tolerance] = Status.CONVERGED
-    return z, residual, status
+    return Solved(z, residual, status)
 
 
 def _line_search(

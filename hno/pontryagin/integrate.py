@@ -1,4 +1,4 @@
-"""Runge-Kutta steps at held control."""
+"""Runge-Kutta steps."""
 
 from __future__ import annotations
 
@@ -7,20 +7,24 @@ from torch import Tensor
 from hno.games import Game
 
 
-def runge_kutta(game: Game, x: Tensor, u: Tensor, dt: float | Tensor) -> Tensor:
-    """One classical Runge-Kutta step of the dynamics at held control.
+def runge_kutta(
+    game: Game, x: Tensor, u: Tensor, dt: float | Tensor, later: tuple[Tensor, Tensor] | None = None
+) -> Tensor:
+    """One classical Runge-Kutta step of the dynamics.
 
     Args:
         game: the game.
         x: states, (B, P, n).
         u: controls, (B, P, m).
         dt: step, s; a tensor must broadcast against x.
+        later: controls in the middle and at the end of the step; u is held without them.
 
     Returns:
         States after the step, (B, P, n).
     """
     first = game.dynamics(x, u)
-    second = game.dynamics(x + dt / 2 * first, u)
-    third = game.dynamics(x + dt / 2 * second, u)
-    fourth = game.dynamics(x + dt * third, u)
+    middle, end = later or (u, u)
+    second = game.dynamics(x + dt / 2 * first, middle)
+    third = game.dynamics(x + dt / 2 * second, middle)
+    fourth = game.dynamics(x + dt * third, end)
     return x + dt / 6 * (first + 2 * second + 2 * third + fourth)

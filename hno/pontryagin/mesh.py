@@ -2,26 +2,10 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
 
 from hno.games import Game
-
-
-class Mesh(NamedTuple):
-    """Time nodes of a batch of trajectories; every label node is one of them."""
-
-    t: Tensor
-    """Increasing times, s, (B, K)."""
-    label_index: Tensor
-    """Places of the label nodes among the nodes, (B, L)."""
-
-    @property
-    def step(self) -> Tensor:
-        """Interval lengths, s, (B, K - 1)."""
-        return self.t.diff(dim=-1)
 
 
 def label_times(game: Game, *, dtype: torch.dtype, device: torch.device) -> Tensor:
@@ -30,20 +14,28 @@ def label_times(game: Game, *, dtype: torch.dtype, device: torch.device) -> Tens
     return torch.linspace(0, game.horizon, steps + 1, dtype=dtype, device=device)
 
 
-def graded_mesh(labels: Tensor, weight: Tensor, extra: int) -> Mesh:
+def graded_mesh(labels: Tensor, weight: Tensor, extra: int) -> Tensor:
     """Split every label interval into as many equal parts as its share of a weight asks for.
 
     Args:
         labels: label times, s, (L,).
         weight: how many of the extra nodes each label interval deserves, up to a factor, (B, L - 1).
         extra: number of nodes to add in total.
+
+    Returns:
+        Increasing times, s, one mesh per row, (B, L + extra); every label time is one of them.
     """
     share = weight.cumsum(-1) / weight.sum(-1, keepdim=True)
     added = torch.nn.functional.pad((extra * share).round(), (1, 0))
     index = added + torch.arange(len(labels), dtype=labels.dtype, device=labels.device)
     nodes = torch.arange(len(labels) + extra, dtype=labels.dtype, device=labels.device)
-    t = interpolate(index, labels.expand_as(index), nodes.expand(len(weight), -1))
-    return Mesh(t, index.long())
+    return interpolate(index, labels.expand_as(index), nodes.expand(len(weight), -1))
+
+
+def label_places(t: Tensor, labels: Tensor) -> Tensor:
+    """Places of the label times (L,) among the nodes (B, K) of meshes that hold them, (B, L)."""
+    slack = 1e-6 * (labels[1] - labels[0])
+    return torch.searchsorted(t.contiguous(), (labels - slack).expand(len(t), -1).contiguous())
 
 
 def interpolate(xs: Tensor, ys: Tensor, at: Tensor) -> Tensor:

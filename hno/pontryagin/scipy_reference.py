@@ -49,7 +49,7 @@ def solve_one(
     game = copy.deepcopy(game).double()
     x0, theta = x0.double(), theta.double()
     t = label_times(game, dtype=x0.dtype, device=x0.device)
-    shapes = manoeuvres(game, dtype=x0.dtype, device=x0.device)[1 : starts + 1]
+    shapes = manoeuvres(game, game.players, dtype=x0.dtype, device=x0.device)[1 : starts + 1]
     attempts = [_attempt(game, x0, theta, t, amplitude * shape, tolerance) for shape in shapes]
     return max(attempts, key=lambda attempt: float(attempt.value.sum().nan_to_num(-torch.inf)))
 

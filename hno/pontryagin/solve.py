@@ -10,9 +10,11 @@ from torch import Tensor
 
 from hno.games import Game
 from hno.games.base import own_costate
-from hno.pontryagin.collocation import Collocation, Iterate, Newton, newton
+from hno.pontryagin.certificates import global_gap, local_gap, reintegration_error
+from hno.pontryagin.collocation import Collocation, Iterate, Newton, Solved, newton, rescue
 from hno.pontryagin.integrate import runge_kutta
-from hno.pontryagin.mesh import Mesh, graded_mesh, label_times
+from hno.pontryagin.mesh import graded_mesh, label_places, label_times
+from hno.pontryagin.saturation import nodes_at_kinks
 from hno.pontryagin.starts import Search, Starts, find_starts
 from hno.pontryagin.sweep import costates, values
 from hno.types import Extremal, Status
@@ -25,6 +27,8 @@ class Solver(NamedTuple):
     newton: Newton = Newton()
     extra_nodes: int = 60
     """Mesh nodes beyond the label nodes, placed where the penalty acts."""
+    reintegration: float = 1e-4
+    """Largest re-integration error of a label, in widths of the PDE box."""
     chunk: int = 128
     """States that are solved together; bounds the memory."""
 
@@ -83,21 +87,29 @@ def _solve_chunk(game: Game, x0: Tensor, theta: Tensor, settings: Solver) -> Ext
         tried[:, 0] = True  # where no start is finite, one fails in Newton and carries the status
         tried = tried.flatten()
         x, u = starts.x.flatten(0, 1)[tried], starts.u.flatten(0, 1)[tried]
-        iterate, mesh = _initial_iterate(game, x, u, types[tried], settings.extra_nodes)
-        z, residual, status = newton(Collocation(game), iterate, settings.newton)
-        found = _describe(game, iterate._replace(z=z), mesh, residual, status)
-        return _best(found, tried.view(size, kept))
+        iterate = _initial_iterate(game, x, u, types[tried], settings.extra_nodes)
+        equations, tried = Collocation(game), tried.view(size, kept)
+        found = newton(equations, iterate, settings.newton)
+        place, converged = _places(tried, found.status)
+        hopeless = place[tried & ~converged.any(1, keepdim=True)]
+        found = rescue(equations, iterate, found, hopeless, settings.newton)
+        row, totals = _best(_total(game, iterate._replace(z=found.z)), found, tried)
+        z, residual, status = found
+        picked, residual, status = iterate._replace(z=z).rows(row), residual[row], status[row]
+        tolerance = settings.reintegration / 100
+        picked, residual, status = nodes_at_kinks(game, picked, residual, status, settings.newton, tolerance)
+        return _describe(game, picked, residual, status, totals, settings)
 
 
-def _initial_iterate(game: Game, x: Tensor, u: Tensor, theta: Tensor, extra: int) -> tuple[Iterate, Mesh]:
+def _initial_iterate(game: Game, x: Tensor, u: Tensor, theta: Tensor, extra: int) -> Iterate:
     """Put a trajectory of held controls on a graded mesh and add its own costates."""
     labels = label_times(game, dtype=x.dtype, device=x.device)
-    mesh = graded_mesh(labels, _encounter_weight(game, labels, x, u, theta), extra)
-    middle = (mesh.t[:, 1:] + mesh.t[:, :-1]) / 2
-    at_nodes = _held(game, labels, x, u, mesh.t)
+    t = graded_mesh(labels, _encounter_weight(game, labels, x, u, theta), extra)
+    middle = (t[:, 1:] + t[:, :-1]) / 2
+    at_nodes = _held(game, labels, x, u, t)
     at_middle = _held(game, labels, x, u, middle)
-    own = own_costate(costates(game, mesh.t, *at_nodes, at_middle, theta))
-    return Iterate(mesh.t, torch.cat([at_nodes[0].flatten(-2), own.flatten(-2)], -1), theta), mesh
+    own = own_costate(costates(game, t, *at_nodes, at_middle, theta))
+    return Iterate(t, torch.cat([at_nodes[0].flatten(-2), own.flatten(-2)], -1), theta)
 
 
 def _held(game: Game, labels: Tensor, x: Tensor, u: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
@@ -120,35 +132,76 @@ def _encounter_weight(game: Game, labels: Tensor, x: Tensor, u: Tensor, theta: T
     return weight / weight.amax(-1, keepdim=True) + 0.05
 
 
-def _describe(game: Game, at: Iterate, mesh: Mesh, residual: Tensor, status: Tensor) -> Extremal:
-    """Extremals on the label grid of solved iterates."""
+class _Path(NamedTuple):
+    """States and controls of an iterate, at the nodes and at the interval centres."""
+
+    x: Tensor
+    u: Tensor
+    middle: tuple[Tensor, Tensor]
+
+
+def _path(game: Game, at: Iterate) -> _Path:
     equations = Collocation(game)
-    centre = equations.midpoint(at.z, equations.rate(at.z, at.theta), mesh.step)
+    centre = equations.midpoint(at.z, equations.rate(at.z, at.theta), at.t.diff(dim=-1))
     (x, own), (middle_x, middle_own) = equations.split(at.z), equations.split(centre)
-    u, middle_u = game.best_response(x, own), game.best_response(middle_x, middle_own)
-    costate = costates(game, mesh.t, x, u, (middle_x, middle_u), at.theta)
-    value = values(game, mesh.t, x, u, (middle_x, middle_u), at.theta)
-    rows = torch.arange(len(x), device=x.device).unsqueeze(-1)
-    everywhere = torch.cat([x, middle_x], 1)
-    gap = -game.constraint(everywhere, at.theta.unsqueeze(1).expand(everywhere.shape[:-1])).amax((1, 2))
-    t = label_times(game, dtype=x.dtype, device=x.device)
-    total = value[:, :1].sum(-1)
-    x, costate, u, value = (part[rows, mesh.label_index] for part in (x, costate, u, value))
-    return Extremal(status, residual, t, x, costate, u, value, at.theta, gap, total)
+    return _Path(x, game.best_response(x, own), (middle_x, game.best_response(middle_x, middle_own)))
 
 
-def _best(found: Extremal, tried: Tensor) -> Extremal:
+def _total(game: Game, at: Iterate) -> Tensor:
+    """Sum of the players' values from the start, (B,)."""
+    return values(game, at.t, *_path(game, at), at.theta)[:, 0].sum(-1)
+
+
+def _places(tried: Tensor, status: Tensor) -> tuple[Tensor, Tensor]:
+    """The row of every start of every state, and which of them converged, (B, S)."""
+    place = torch.full(tried.shape, -1, device=tried.device)
+    place[tried] = torch.arange(len(status), device=tried.device)
+    return place, tried & (status[place] == Status.CONVERGED)
+
+
+def _best(total: Tensor, found: Solved, tried: Tensor) -> tuple[Tensor, Tensor]:
     """For each state the converged start with the largest sum of values, or else the smallest residual.
 
     Args:
-        found: one row per start that was tried.
+        total: sum of values of every start that was tried, (R,).
+        found: where Newton ended, R rows.
         tried: which starts those are, (B, S).
+
+    Returns:
+        The row of each state's best start, (B,), and the totals, NaN where a start did not converge, (B, S).
     """
-    place = torch.full(tried.shape, -1, device=tried.device)
-    place[tried] = torch.arange(len(found.status), device=tried.device)
-    converged = tried & (found.status[place] == Status.CONVERGED)
-    total = torch.where(converged, found.alternatives[place, 0], torch.nan)
-    score = torch.where(converged, total, -1e30 * (1 + found.residual[place].clamp_max(1e30)))
-    row = place.gather(1, score.masked_fill(~tried, -torch.inf).argmax(1, keepdim=True)).squeeze(1)
-    picked = {name: getattr(found, name)[row] for name in Extremal._fields if name not in ("t", "alternatives")}
-    return Extremal(t=found.t, alternatives=total, **picked)
+    place, converged = _places(tried, found.status)
+    totals = torch.where(converged, total[place], torch.nan)
+    score = torch.where(converged, totals, -1e30 * (1 + found.residual[place].clamp_max(1e30)))
+    return place.gather(1, score.masked_fill(~tried, -torch.inf).argmax(1, keepdim=True)).squeeze(1), totals
+
+
+def _describe(
+    game: Game, at: Iterate, residual: Tensor, status: Tensor, totals: Tensor, settings: Solver
+) -> Extremal:
+    """Extremals on the label grid of solved iterates, with their certificates."""
+    path = x, u, middle = _path(game, at)
+    costate = costates(game, at.t, *path, at.theta)
+    value = values(game, at.t, *path, at.theta)
+    everywhere = torch.cat([x, middle[0]], 1)
+    clearance = -game.constraint(everywhere, at.theta.unsqueeze(1).expand(everywhere.shape[:-1])).amax((1, 2))
+    t = label_times(game, dtype=x.dtype, device=x.device)
+    drift = reintegration_error(game, at)
+    astray = (status == Status.CONVERGED) & (drift > settings.reintegration)
+    rows = torch.arange(len(x), device=x.device).unsqueeze(-1)
+    x, costate, u, value = (part[rows, label_places(at.t, t)] for part in (x, costate, u, value))
+    return Extremal(
+        status=status.masked_fill(astray, Status.INACCURATE),
+        residual=residual,
+        t=t,
+        x=x,
+        costate=costate,
+        u=u,
+        value=value,
+        theta=at.theta,
+        clearance=clearance,
+        reintegration=drift,
+        local_gap=local_gap(game, at),
+        global_gap=global_gap(game, x[:, 0], u, at.theta, settings.search),
+        alternatives=totals,
+    )

@@ -56,13 +56,13 @@ def find_starts(game: Game, start: Tensor, theta: Tensor, search: Search) -> Sta
     t = label_times(game, dtype=start.dtype, device=start.device)
     nodes = torch.arange(0, len(t) - 1, search.coarse, device=start.device)
     times = torch.cat([t[nodes], t[-1:]])
-    shapes = manoeuvres(game, dtype=start.dtype, device=start.device)[:, nodes]
+    shapes = manoeuvres(game, game.players, dtype=start.dtype, device=start.device)[:, nodes]
     size, count = len(start), len(shapes)
     rows = torch.arange(size, device=start.device).repeat_interleave(count)
     options = {"margin": search.margin, "points": search.points * search.coarse}
-    v = _best_amplitude(
-        HeldControls(game, times, theta[rows], **options), start[rows], shapes.repeat(size, 1, 1, 1), search.amplitudes
-    )
+    guarded = HeldControls(game, times, theta[rows], **options)
+    base = at_rest(guarded, start[rows]).unsqueeze(1).expand(-1, len(nodes), -1, -1)
+    v, _ = best_amplitude(guarded, start[rows], base, shapes.repeat(size, 1, 1, 1), search.amplitudes)
     for iterations, kept in search.rounds:
         guarded = HeldControls(game, times, theta[rows], **options)
         x, v, cost = descend(guarded, start[rows], v, iterations, search.tolerance)
@@ -75,14 +75,15 @@ def find_starts(game: Game, start: Tensor, theta: Tensor, search: Search) -> Sta
     return Starts(x[order], exact.control(v)[order], cost)
 
 
-def manoeuvres(game: Game, *, dtype: torch.dtype, device: torch.device) -> Tensor:
+def manoeuvres(game: Game, players: int, *, dtype: torch.dtype, device: torch.device) -> Tensor:
     """Shapes of evasive manoeuvres in scaled controls: out and back, per channel and sign pattern, (S, N, P, m).
 
-    One channel at a time, every player goes one way or the other; the first shape is no manoeuvre at all.
+    One channel at a time, every player goes one way or the other; the first shape is no manoeuvre at all. With one player
+    the last axis but one has length 1 and fits any player.
     """
     steps = round(game.horizon / game.label_step)
     wave = torch.sin(2 * torch.pi * (torch.arange(steps, dtype=dtype, device=device) + 0.5) / steps)
-    players, controls = game.players, game.control_dim
+    controls = game.control_dim
     signs = torch.tensor(list(itertools.product((1.0, -1.0), repeat=players)), dtype=dtype, device=device)
     channels = torch.eye(controls, dtype=dtype, device=device)
     patterns = torch.einsum("sp,km->skpm", signs, channels).flatten(0, 1)
@@ -90,13 +91,31 @@ def manoeuvres(game: Game, *, dtype: torch.dtype, device: torch.device) -> Tenso
     return wave.view(-1, 1, 1) * patterns.unsqueeze(1)
 
 
-def _best_amplitude(problem: HeldControls, start: Tensor, shape: Tensor, amplitudes: tuple[float, ...]) -> Tensor:
-    """The cheapest size of each manoeuvre around the controls of a player at rest, (R, N, P, m)."""
-    neutral = problem.scaled(problem.game.best_response(start, torch.zeros_like(start))).unsqueeze(1)
-    tried = [(neutral + size * shape).clamp(-1, 1) for size in amplitudes]
+def at_rest(problem: HeldControls, start: Tensor) -> Tensor:
+    """Scaled controls of players who want nothing, (R, P, m)."""
+    return problem.scaled(problem.game.best_response(start, torch.zeros_like(start)))
+
+
+def best_amplitude(
+    problem: HeldControls, start: Tensor, base: Tensor, shape: Tensor, amplitudes: tuple[float, ...]
+) -> tuple[Tensor, Tensor]:
+    """The cheapest size of each manoeuvre.
+
+    Args:
+        problem: a problem of R rows.
+        start: initial states, (R, P, n).
+        base: scaled controls without the manoeuvre, (R, N, P, m).
+        shape: the manoeuvre, (R, N, P, m).
+        amplitudes: sizes to try.
+
+    Returns:
+        Scaled controls (R, N, P, m) and their cost (R,).
+    """
+    tried = [(base + size * shape).clamp(-1, 1) for size in amplitudes]
     costs = torch.stack([problem.cost(problem.rollout(start, v), v) for v in tried])
     rows = torch.arange(len(start), device=start.device)
-    return torch.stack(tried)[costs.nan_to_num(torch.inf).argmin(0), rows]
+    cost, best = costs.nan_to_num(torch.inf).min(0)
+    return torch.stack(tried)[best, rows], cost
 
 
 def _cheapest(x: Tensor, cost: Tensor, size: int, tolerance: float = 1e-2) -> tuple[Tensor, Tensor]:
