@@ -16,7 +16,7 @@ from hno.pontryagin.mesh import label_times
 from hno.pontryagin.starts import Search, at_rest, best_amplitude, manoeuvres
 
 
-def reintegrate(game: Game, at: Iterate, substeps: int = 2) -> Tensor:
+def replay(game: Game, at: Iterate, substeps: int = 2) -> tuple[Tensor, Tensor]:
     """Drive the states from their start with the controls of a solution, by Runge-Kutta steps.
 
     Args:
@@ -25,23 +25,28 @@ def reintegrate(game: Game, at: Iterate, substeps: int = 2) -> Tensor:
         substeps: steps in each mesh interval.
 
     Returns:
-        States at the end, (B, P, n).
+        States at the end (B, P, n), and V_i of what was driven, by Simpson's rule (B, P).
     """
-    equations = Collocation(game)
+    equations, theta = Collocation(game), at.theta
     share = torch.linspace(0, 1, 2 * substeps + 1, dtype=at.z.dtype, device=at.z.device)
     u = game.best_response(*equations.split(equations.interpolate(at, share)))
     x, dt = equations.split(at.z[:, 0])[0], at.t.diff(dim=-1)[..., None, None] / substeps
+    cost = torch.zeros_like(theta)
     for k in range(dt.shape[1]):
         for s in range(0, 2 * substeps, 2):
-            start, *later = u[:, k, s : s + 3].unbind(1)
-            x = runge_kutta(game, x, start, dt[:, k], (later[0], later[1]))
-    return x
+            first, middle, last = u[:, k, s : s + 3].unbind(1)
+            half = runge_kutta(game, x, first, dt[:, k] / 2, ((first + middle) / 2, middle))
+            end = runge_kutta(game, x, first, dt[:, k], (middle, last))
+            rates = [game.running_cost(*pair, theta) for pair in ((x, first), (half, middle), (end, last))]
+            cost = cost + dt[:, k, 0] / 6 * (rates[0] + 4 * rates[1] + rates[2])
+            x = end
+    return x, game.terminal_value(x) - cost
 
 
 def reintegration_error(game: Game, at: Iterate) -> Tensor:
     """Largest distance between the ends of a solution and of its re-integration, in widths of the PDE box, (B,)."""
     end = Collocation(game).split(at.z[:, -1])[0]
-    return ((reintegrate(game, at) - end).abs() / game.state_box.width).amax((-2, -1)).nan_to_num(nan=torch.inf)
+    return ((replay(game, at)[0] - end).abs() / game.state_box.width).amax((-2, -1)).nan_to_num(nan=torch.inf)
 
 
 def local_gap(game: Game, at: Iterate, iterations: int = 10) -> Tensor:

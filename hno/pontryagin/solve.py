@@ -51,7 +51,7 @@ def solve(game: Game, x0: Tensor, theta: Tensor, settings: Solver = Solver()) ->
     _check(game, x0, theta)
     game = copy.deepcopy(game).to(x0.device).double()
     parts = zip(x0.double().split(settings.chunk), theta.double().split(settings.chunk), strict=True)
-    return join([_solve_chunk(game, *part, settings) for part in parts])
+    return join([_describe(game, solve_on_mesh(game, *part, settings), settings) for part in parts])
 
 
 def join(parts: list[Extremal]) -> Extremal:
@@ -77,28 +77,37 @@ def _first_bad_row(tensor: Tensor) -> int:
     return int((~tensor.isfinite()).flatten(1).any(-1).nonzero()[0])
 
 
-def _solve_chunk(game: Game, x0: Tensor, theta: Tensor, settings: Solver) -> Extremal:
+class OnMesh(NamedTuple):
+    """The best trajectory of every state, on its own mesh."""
+
+    at: Iterate
+    """States and own costates."""
+    residual: Tensor
+    """Largest scaled collocation residuals, (B,)."""
+    status: Tensor
+    """`Status`, (B,)."""
+    alternatives: Tensor
+    """Sums of values of all starts, NaN where they did not converge, (B, S)."""
+
+
+def solve_on_mesh(game: Game, x0: Tensor, theta: Tensor, settings: Solver = Solver()) -> OnMesh:
+    """What `solve` does up to the certificates and the label grid: all states at once, in float64."""
     with torch.no_grad():
         starts = find_starts(copy.deepcopy(game).float(), x0.float(), theta.float(), settings.search)
         starts = Starts(*(part.double() for part in starts))
-        size, kept = starts.cost.shape
-        types = theta.repeat_interleave(kept, 0)
         tried = starts.cost.isfinite()
         tried[:, 0] = True  # where no start is finite, one fails in Newton and carries the status
-        tried = tried.flatten()
-        x, u = starts.x.flatten(0, 1)[tried], starts.u.flatten(0, 1)[tried]
-        iterate = _initial_iterate(game, x, u, types[tried], settings.extra_nodes)
-        equations, tried = Collocation(game), tried.view(size, kept)
+        row, column = tried.nonzero().unbind(-1)
+        iterate = _initial_iterate(game, starts.x[row, column], starts.u[row, column], theta[row], settings.extra_nodes)
+        equations = Collocation(game)
         found = newton(equations, iterate, settings.newton)
         place, converged = _places(tried, found.status)
         hopeless = place[tried & ~converged.any(1, keepdim=True)]
         found = rescue(equations, iterate, found, hopeless, settings.newton)
-        row, totals = _best(_total(game, iterate._replace(z=found.z)), found, tried)
-        z, residual, status = found
-        picked, residual, status = iterate._replace(z=z).rows(row), residual[row], status[row]
-        tolerance = settings.reintegration / 100
-        picked, residual, status = nodes_at_kinks(game, picked, residual, status, settings.newton, tolerance)
-        return _describe(game, picked, residual, status, totals, settings)
+        best, totals = _best(_total(game, iterate._replace(z=found.z)), found, tried)
+        picked, drift = iterate._replace(z=found.z).rows(best), settings.reintegration / 100
+        again = nodes_at_kinks(game, picked, found.residual[best], found.status[best], settings.newton, drift)
+        return OnMesh(*again, totals)
 
 
 def _initial_iterate(game: Game, x: Tensor, u: Tensor, theta: Tensor, extra: int) -> Iterate:
@@ -176,10 +185,9 @@ def _best(total: Tensor, found: Solved, tried: Tensor) -> tuple[Tensor, Tensor]:
     return place.gather(1, score.masked_fill(~tried, -torch.inf).argmax(1, keepdim=True)).squeeze(1), totals
 
 
-def _describe(
-    game: Game, at: Iterate, residual: Tensor, status: Tensor, totals: Tensor, settings: Solver
-) -> Extremal:
-    """Extremals on the label grid of solved iterates, with their certificates."""
+def _describe(game: Game, found: OnMesh, settings: Solver) -> Extremal:
+    """Extremals on the label grid, with their certificates."""
+    at, residual, status, totals = found
     path = x, u, middle = _path(game, at)
     costate = costates(game, at.t, *path, at.theta)
     value = values(game, at.t, *path, at.theta)
