@@ -6,9 +6,11 @@ Quantities are in physical units; `tau` is time to go (0 is terminal), `t` runs 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from enum import IntEnum
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
 
@@ -117,6 +119,17 @@ class Extremal(NamedTuple):
     """The same from several manoeuvres; above some 1e-3 the equilibrium is a local one, (B, P)."""
     alternatives: Tensor
     """Sum of values of every start that was tried, NaN where it did not converge, shape (B, starts)."""
+
+
+def join(parts: Sequence[Extremal]) -> Extremal:
+    """Extremals of one game, one after the other."""
+    batched = {name: torch.cat([getattr(part, name) for part in parts]) for name in Extremal._fields if name != "t"}
+    return Extremal(t=parts[0].t, **batched)
+
+
+def part(found: Extremal, rows: slice | Tensor) -> Extremal:
+    """Some rows of extremals."""
+    return Extremal(**{name: column if name == "t" else column[rows] for name, column in found._asdict().items()})
 
 
 class Trajectory(NamedTuple):

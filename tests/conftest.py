@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from hno.data.generate import Request, labels_for
+from hno.data.labels import Request, labels_for
 from hno.games import make
 from hno.types import Extremal
 

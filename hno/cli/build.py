@@ -12,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from hno.cli.logs import StepLines, loggers, progress_bar
 from hno.data import GameData
 from hno.data.curriculum import Curriculum
-from hno.data.generate import Progress, default_cache
+from hno.data.labels import Report, default_cache
 from hno.evaluation.callbacks import StopOnDivergence, checkpoints
 from hno.games import Game, make
 from hno.losses import losses
@@ -77,7 +77,7 @@ def build_operator(config: DictConfig, game: Game) -> ValueOperator:
     )
 
 
-def build_data(config: DictConfig, operator: ValueOperator, progress: Progress | None = None) -> GameData:
+def build_data(config: DictConfig, operator: ValueOperator, report: Report | None = None) -> GameData:
     """The streams that the operator's terms read."""
     data, steps = config.data, config.trainer.max_steps
     return GameData(
@@ -93,7 +93,7 @@ def build_data(config: DictConfig, operator: ValueOperator, progress: Progress |
         interior_types=data.interior_types,
         validation=data.validation,
         workers=data.workers,
-        progress=progress,
+        report=report,
     )
 
 

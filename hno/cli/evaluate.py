@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import logging
 import math
 import time
@@ -18,19 +17,16 @@ from hno.cli.config import run_command
 from hno.cli.logs import label_progress, send_lightning_to_hydra
 from hno.cli.results import Results, config_hash
 from hno.cli.summary import report, show
-from hno.data.generate import Request, labels_for
+from hno.data.labels import Request, labels_for
 from hno.evaluation.closed_loop import TypeRow, collision_table
 from hno.evaluation.rollout import control_steps, rollout
 from hno.games import Game
+from hno.games.grid import parse_types
 from hno.operators.checkpoint import OperatorPolicy, load_operator
 from hno.report.picture import PlotsMissingError, rollout_picture, typical
 from hno.types import Extremal
 
 log = logging.getLogger(__name__)
-
-GRIDS = {"grid5": 5, "grid9": 9}
-"""Named grids over the type box: points per player."""
-
 
 def main() -> None:
     """Entry point."""
@@ -67,14 +63,14 @@ def _run(config: DictConfig, results: Results) -> None:
     operator = policy.operator
     results.update(**operator.names())
     check_evaluation(policy.game, config)
-    types = parse_types(config.theta, policy, config.unseen)
+    types = types_to_evaluate(config.theta, policy, config.unseen)
     cache = cache_folder(config.cache)
     labels = solve_tests(policy.game, types, config.starts, config.seed, cache, config.workers, results)
     evaluate_policy(policy, labels, results, config.clearance, config.dt)
     results.update(status="finished")
 
 
-def parse_types(text: str, policy: OperatorPolicy, unseen: Sequence[Sequence[float]] = ()) -> list[tuple[float, ...]]:
+def types_to_evaluate(text: str, policy: OperatorPolicy, unseen: Sequence[Sequence[float]] = ()) -> list[tuple[float, ...]]:
     """Player types from "default", a named grid, or a list such as "1,1;2.5,4".
 
     Default are the labelled types, and those of `unseen` that lie in the game's type box.
@@ -87,17 +83,7 @@ def parse_types(text: str, policy: OperatorPolicy, unseen: Sequence[Sequence[flo
         own = [theta for theta in unseen if len(theta) == game.players]
         inside = [theta for theta in own if bool(game.type_box.contains(torch.tensor(theta)))]
         return list(dict.fromkeys([*policy.operator.seen_types, *game.validate_types(inside)]))
-    if text in GRIDS:
-        corners = zip(game.type_box.lo.tolist(), game.type_box.hi.tolist(), strict=True)
-        steps = GRIDS[text] - 1
-        axes = [[lo + (hi - lo) * k / steps for k in range(steps + 1)] for lo, hi in corners]
-        return game.validate_types(list(itertools.product(*axes)))
-    try:
-        types = [[float(entry) for entry in part.split(",")] for part in str(text).split(";")]
-    except ValueError as error:
-        known = ", ".join(("default", *GRIDS))
-        raise ValueError(f"theta must be one of {known}, or a list such as '1,1;2.5,4'; got {text!r}.") from error
-    return game.validate_types(types)
+    return parse_types(game, text)
 
 
 def solve_tests(
@@ -111,7 +97,7 @@ def solve_tests(
 ) -> list[Extremal]:
     """Labels of the test starts of every type, from the cache or solved."""
     requests = [Request(theta, starts, seed, "test") for theta in types]
-    labels, seconds = labels_for(game, requests, cache, workers=workers, progress=label_progress())
+    labels, seconds = labels_for(game, requests, cache, workers=workers, report=label_progress())
     results.time("test_labels", seconds)
     results.update(test_seed=seed)
     return labels

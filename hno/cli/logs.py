@@ -18,7 +18,7 @@ from lightning.pytorch.callbacks import ProgressBar, RichProgressBar
 from lightning.pytorch.loggers import CSVLogger, Logger, WandbLogger
 from omegaconf import DictConfig, OmegaConf
 
-from hno.data.generate import Progress
+from hno.data.labels import Progress, Report
 from hno.registry import UnknownNameError, unknown_name
 
 log = logging.getLogger(__name__)
@@ -102,16 +102,17 @@ def _reachable(url: str, seconds: float = 3.0) -> bool:
         return False
 
 
-def label_progress(every: float = 10.0) -> Progress:
+def label_progress(every: float = 10.0) -> Report:
     """A function that logs how many labels are solved, at most one line every so many seconds."""
     began = last = time.monotonic()
 
-    def say(done: int, total: int) -> None:
+    def say(progress: Progress) -> None:
         nonlocal last
         now = time.monotonic()
-        if now - last >= every or done == total:
+        if now - last >= every or progress.done == progress.total:
             last = now
-            log.info("labels: %d of %d solved in %.0f s", done, total, now - began)
+            failed = f", {progress.done - progress.converged} failed" if progress.converged < progress.done else ""
+            log.info("labels: %d of %d in %.0f s%s", progress.done, progress.total, now - began, failed)
 
     return say
 

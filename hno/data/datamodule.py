@@ -14,11 +14,11 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, IterableDataset
 
 from hno.data.curriculum import Curriculum
-from hno.data.generate import Progress, Request, labels_for
+from hno.data.labels import Report, Request, labels_for
 from hno.data.sampling import check_shares, sample_states
 from hno.games import Game
 from hno.pontryagin.solve import Solver
-from hno.types import Batch, Extremal, Labels, Points, Sample, Status
+from hno.types import Batch, Extremal, Labels, Points, Sample, Status, part
 
 
 class Rows(NamedTuple):
@@ -60,10 +60,6 @@ def rows_of(game: Game, extremals: Sequence[Extremal]) -> Rows:
     return Rows(Points(tau, x, theta), Labels(value, costate))
 
 
-def _part(found: Extremal, rows: slice) -> Extremal:
-    return Extremal(**{name: part if name == "t" else part[rows] for name, part in found._asdict().items()})
-
-
 def _columns(game: Game, found: Extremal, good: Tensor) -> tuple[Tensor, ...]:
     count, nodes = int(good.sum()), len(found.t)
     tau = (game.horizon - found.t).expand(count, -1)
@@ -90,7 +86,7 @@ class GameData(L.LightningDataModule):
         validation: trajectories per type that are held out.
         solver: settings of the label solver.
         workers: label processes; the number of cores by default.
-        progress: called as labels are solved.
+        report: called as labels are written.
     """
 
     def __init__(
@@ -108,7 +104,7 @@ class GameData(L.LightningDataModule):
         validation: int = 8,
         solver: Solver = Solver(),
         workers: int | None = None,
-        progress: Progress | None = None,
+        report: Report | None = None,
     ) -> None:
         super().__init__()
         check_shares(shares)
@@ -127,7 +123,7 @@ class GameData(L.LightningDataModule):
         self.types = torch.tensor(self.type_list)
         self.batch_sizes, self.curriculum, self.shares = dict(batch_sizes), curriculum, dict(shares)
         self.interior_types, self.cache, self.solver, self.workers = interior_types, cache, solver, workers
-        self.progress = progress
+        self.report = report
         self.requests = [Request(theta, trajectories + validation, seed, "train") for theta in self.type_list]
         self.validation = validation
         self.label_seconds = 0.0
@@ -137,7 +133,7 @@ class GameData(L.LightningDataModule):
         """Solve what the cache lacks."""
         if self.extremals:
             return
-        arguments = self.game, self.requests, self.cache, self.solver, self.workers, self.progress
+        arguments = self.game, self.requests, self.cache, self.solver, self.workers, self.report
         self.extremals, self.label_seconds = labels_for(*arguments)
 
     def setup(self, stage: str) -> None:
@@ -145,8 +141,8 @@ class GameData(L.LightningDataModule):
         if not self.extremals:
             self.extremals, _ = labels_for(self.game, self.requests, self.cache, self.solver, self.workers)
         held_out = -self.validation
-        self.train_rows = rows_of(self.game, [_part(found, slice(held_out)) for found in self.extremals])
-        self.val_rows = rows_of(self.game, [_part(found, slice(held_out, None)) for found in self.extremals])
+        self.train_rows = rows_of(self.game, [part(found, slice(held_out)) for found in self.extremals])
+        self.val_rows = rows_of(self.game, [part(found, slice(held_out, None)) for found in self.extremals])
 
     def label_scales(self) -> tuple[Tensor, Tensor]:
         """Mean absolute value, scalar, and mean absolute costate, (P, P, n), of the training labels.

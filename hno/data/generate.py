@@ -1,152 +1,159 @@
-"""Labels on demand: start states by seed, solved where the cache lacks them."""
+"""Label sets from the command line: `python -m hno.data.generate game=<name> theta=<types> n=<starts per type>`."""
 
 from __future__ import annotations
 
-import hashlib
 import os
-import tempfile
+import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import joblib
-import torch
-from torch import Tensor
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
 
-from hno.data.store import canonical_json, read_labels, write_labels
-from hno.games import Game
-from hno.pontryagin.solve import Solver, join, solve
-from hno.types import Extremal
+from hno.data import labels as label_data
+from hno.data.labels import Report, Request, default_cache, label_set, labels_for
+from hno.data.store import LabelFileError
+from hno.data.trust import summary
+from hno.games import Game, make
+from hno.games.grid import parse_types
+from hno.types import Status
 
-SOLVER_VERSION = 1
-"""Counted up when the solver's results change, which makes cached labels stale."""
+USAGE = """Solve open-loop equilibria from random start states and keep them, with their certificates.
 
+    python -m hno.data.generate game=narrow_road theta=grid5 n=1000
 
-class Request(NamedTuple):
-    """A set of labels: `starts` start states of one type, drawn by `seed`."""
+game       name of a registered game
+theta      player types: grid5, grid9, or a list such as "1,1;2.5,4"
+n          start states per type; more of them extend a set that is there
+seed       of the start states (0)
+split      what they are for: train, or test for evaluations (train)
+widen      width of the start box in units of the game's (1)
+constants  of the game, such as constants.radius=1.3
+workers    processes with one thread each (the number of cores)
+cache      folder of the label sets ($HNO_CACHE, or the user's cache folder)
 
-    theta: tuple[float, ...]
-    """Player types."""
-    starts: int
-    """Number of start states."""
-    seed: int
-    """Seed of the start states."""
-    split: str
-    """What the states are for, "train" or "test": different splits never share states."""
-    widen: float = 1.0
-    """Width of the start box in units of the game's."""
+A run that was stopped goes on where it was. Several runs may share one folder."""
 
-
-Progress = Callable[[int, int], None]
-"""Called with (states done, states in all)."""
-
-
-def default_cache() -> Path:
-    """$HNO_CACHE, or the user's cache folder."""
-    fallback = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "hno"
-    return Path(os.environ.get("HNO_CACHE", fallback))
-
-
-def start_states(game: Game, request: Request) -> Tensor:
-    """Uniform start states of a request, float64, (starts, P, n)."""
-    text = canonical_json({"seed": request.seed, "split": request.split, "theta": request.theta})
-    generator = torch.Generator().manual_seed(int(hashlib.sha256(text.encode()).hexdigest()[:15], 16))
-    return game.initial_box.widened(request.widen).cpu().sample(request.starts, generator).double()
+DEFAULTS: dict[str, Any] = {
+    "game": "???",
+    "theta": "???",
+    "n": "???",
+    "seed": 0,
+    "split": "train",
+    "widen": 1.0,
+    "constants": {},
+    "workers": None,
+    "cache": None,
+}
 
 
-def labels_for(
-    game: Game,
-    requests: Sequence[Request],
-    cache: Path,
-    settings: Solver = Solver(),
-    workers: int | None = None,
-    progress: Progress | None = None,
-) -> tuple[list[Extremal], float]:
-    """Labels of every request, read from the cache or solved and written to it.
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Entry point; the exit code is 0 only if every set is complete."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    if not given or {"-h", "--help", "help"} & set(given):
+        print(USAGE)
+        return 0 if given else 2
+    try:
+        run(read_options(given))
+    except (OSError, LookupError, ValueError, TypeError, LabelFileError, OmegaConfBaseException) as error:
+        text = error.args[0] if isinstance(error, KeyError) and error.args else error
+        print(f"{type(error).__name__}: {text}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("Stopped. Finished shards are kept: the same command goes on from here.", file=sys.stderr)
+        return 130
+    return 0
 
-    Args:
-        game: the game.
-        requests: what is needed.
-        cache: folder of label files.
-        settings: solver settings, part of the cache key.
-        workers: processes with one thread each; the number of cores by default.
-        progress: called as states are solved.
 
-    Returns:
-        One `Extremal` per request, failed rows included, and the seconds spent on solving.
+def read_options(given: Sequence[str]) -> DictConfig:
+    """Options from `name=value` words.
 
     Raises:
-        LabelFileError: a cached file is damaged.
+        ValueError: an unknown or missing option, or a value that makes no sense.
     """
-    began = time.perf_counter()
-    paths = [label_path(game, request, cache, settings) for request in requests]
-    missing = [index for index, path in enumerate(paths) if not path.exists()]
-    found: dict[int, Extremal] = {i: read_labels(path)[0] for i, path in enumerate(paths) if i not in missing}
-    if missing:
-        _check_writable(cache)
-    jobs = [(i, part) for i in missing for part in start_states(game, requests[i]).split(settings.chunk)]
-    pieces: dict[int, list[Extremal]] = {i: [] for i in missing}
-    waiting = {i: sum(job[0] == i for job in jobs) for i in missing}
-    done, total = 0, sum(len(part) for _, part in jobs)
-    for (index, part), piece in zip(jobs, _solve_all(game, requests, jobs, settings, workers), strict=True):
-        pieces[index].append(piece)
-        done += len(part)
-        if progress is not None:
-            progress(done, total)
-        if len(pieces[index]) == waiting[index]:
-            found[index] = join(pieces.pop(index))
-            write_labels(paths[index], found[index], provenance(game, requests[index], settings))
-    return [found[i] for i in range(len(requests))], time.perf_counter() - began
+    wrong = [word for word in given if "=" not in word]
+    options = OmegaConf.from_cli([word for word in given if "=" in word])
+    wrong += [str(name) for name in options if name not in DEFAULTS]
+    merged = OmegaConf.merge(DEFAULTS, options)
+    assert isinstance(merged, DictConfig)
+    missing = [name for name in DEFAULTS if OmegaConf.is_missing(merged, name)]
+    if wrong or missing:
+        what = f"Unknown: {', '.join(wrong)}." if wrong else f"Missing: {', '.join(missing)}."
+        raise ValueError(f"{what} Options are written as name=value: {', '.join(DEFAULTS)}.")
+    for name, least in (("n", 1), ("seed", 0), ("workers", 1)):
+        value = merged[name]
+        if not (isinstance(value, int) and value >= least) and not (name == "workers" and value is None):
+            raise ValueError(f"{name} must be a whole number of at least {least}; got {value!r}.")
+    if merged.split not in ("train", "test"):
+        raise ValueError(f"split must be train or test; got {merged.split!r}.")
+    if not (isinstance(merged.widen, (int, float)) and 0 < merged.widen < float("inf")):
+        raise ValueError(f"widen must be a positive number; got {merged.widen!r}.")
+    return merged
 
 
-def _check_writable(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise OSError(
-            f"Labels cannot be written to {folder} ({error}). Choose another folder with $HNO_CACHE."
-        ) from error
+def run(options: DictConfig) -> None:
+    """Generate, and print a table and where the sets are."""
+    game = make(options.game, **{str(name): value for name, value in options.constants.items()})
+    cache = default_cache() if options.cache is None else Path(options.cache)
+    requests = [
+        Request(theta, options.n, options.seed, options.split, float(options.widen))
+        for theta in parse_types(game, str(options.theta))
+    ]
+    console = Console()
+    with progress_report(console) as report:
+        found, seconds = labels_for(game, requests, cache, workers=options.workers, report=report)
+    rows = [summary(labels) for labels in found]
+    console.print(_table(game, requests, rows))
+    for status in Status:
+        count = sum(row["status"][status.name.lower()] for row in rows)
+        if count and status != Status.CONVERGED:
+            console.print(f"{count} {status.name.lower()}: {status.advice}.", highlight=False)
+    console.print(f"{seconds:.0f} s. Label sets:", highlight=False)
+    for request in requests:
+        print(label_set(game, request, cache).folder)
 
 
-def label_path(game: Game, request: Request, cache: Path, settings: Solver) -> Path:
-    """File of a request; its name holds a hash of everything that determines the labels."""
-    key = hashlib.sha256(canonical_json(provenance(game, request, settings)).encode()).hexdigest()[:16]
-    types = "-".join(f"{t:g}" for t in request.theta)
-    return cache / type(game).__name__ / f"{types}_{request.split}{request.seed}_n{request.starts}_{key}.safetensors"
+@contextmanager
+def progress_report(console: Console, every: float = 10.0) -> Iterator[Report]:
+    """A live bar on a terminal, elsewhere a line every so many seconds."""
+    columns = (BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+    began = last = time.monotonic()
+    with Progress(*columns, TimeRemainingColumn(), console=console, disable=not console.is_terminal) as bar:
+        task = bar.add_task("solving", total=None)
+
+        def say(now: label_data.Progress) -> None:
+            nonlocal last
+            clock = time.monotonic()
+            rate = now.done / max(clock - began, 1e-9)
+            text = f"{now.converged} converged, {now.done - now.converged} failed, {rate:.1f}/s"
+            bar.update(task, completed=now.done, total=now.total, description=text)
+            if not console.is_terminal and (clock - last >= every or now.done == now.total):
+                last = clock
+                left = (now.total - now.done) / rate
+                print(f"{now.done} of {now.total}: {text}, {left:.0f} s left", flush=True)
+
+        yield say
 
 
-def provenance(game: Game, request: Request, settings: Solver) -> dict[str, Any]:
-    """Everything that determines the labels of a request."""
-    return {
-        "game": type(game).__name__,
-        "fingerprint": game.fingerprint(),
-        "request": request._asdict(),
-        "solver": _plain(settings),
-        "solver_version": SOLVER_VERSION,
-    }
+def _table(game: Game, requests: Sequence[Request], rows: Sequence[dict[str, Any]]) -> Table:
+    table = Table(title=f"{type(game).__name__}, split {requests[0].split}, seed {requests[0].seed}")
+    columns = ("theta", "starts", "converged", "inevitable collisions", "safe", "re-integration", "local gap", "global gap")
+    for name in columns:
+        table.add_column(name, justify="right")
+    for request, row in zip(requests, rows, strict=True):
+        worst = [row[f"largest_{name}"] for name in ("reintegration", "local_gap", "global_gap")]
+        cells = [row["status"]["converged"], f"{row['inevitable'] / row['starts']:.1%}", row["safe"]]
+        types = ", ".join(f"{t:g}" for t in request.theta)
+        table.add_row(types, str(row["starts"]), *map(str, cells), *("-" if w is None else f"{w:.0e}" for w in worst))
+    return table
 
 
-def _plain(settings: Any) -> Any:
-    if hasattr(settings, "_asdict"):
-        return {name: _plain(value) for name, value in settings._asdict().items()}
-    return list(settings) if isinstance(settings, tuple) else settings
-
-
-def _solve_all(
-    game: Game, requests: Sequence[Request], jobs: Sequence[tuple[int, Tensor]], settings: Solver, workers: int | None
-) -> Any:
-    workers = min(workers or os.cpu_count() or 1, len(jobs))
-    types = [torch.tensor(request.theta, dtype=torch.float64) for request in requests]
-    tasks = ((game, part, types[i].expand(len(part), -1), settings) for i, part in jobs)
-    if workers <= 1:
-        return (solve(*task) for task in tasks)
-    pool = joblib.Parallel(n_jobs=workers, return_as="generator", inner_max_num_threads=1, backend="loky")
-    return pool(joblib.delayed(_solve_alone)(*task) for task in tasks)
-
-
-def _solve_alone(game: Game, x0: Tensor, theta: Tensor, settings: Solver) -> Extremal:
-    torch.set_num_threads(1)
-    return solve(game, x0, theta, settings)
+if __name__ == "__main__":
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    raise SystemExit(main())

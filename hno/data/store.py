@@ -17,7 +17,7 @@ from torch import Tensor
 
 from hno.types import Extremal
 
-FORMAT = 1
+FORMAT = 2
 """Version of the file layout."""
 KEY = "hno"
 """The metadata key that holds the canonical JSON."""
@@ -91,6 +91,25 @@ def read_labels(path: Path) -> tuple[Extremal, dict[str, Any]]:
     if found[1] != _digest(tensors):
         raise LabelFileError(f"{path} is damaged: its content does not match its checksum. {_ADVICE}")
     return Extremal(**tensors), found[2]
+
+
+def row_count(path: Path) -> int:
+    """How many rows a label file has, by its header.
+
+    Raises:
+        LabelFileError: not a label file.
+    """
+    try:
+        with safetensors.safe_open(path, framework="pt") as file:
+            return int(file.get_slice("status").get_shape()[0])
+    except (safetensors.SafetensorError, OSError) as error:
+        raise LabelFileError(f"{path} cannot be read as a label file ({error}). {_ADVICE}") from error
+
+
+def checksum(path: Path) -> str:
+    """The checksum of its content that a label file carries."""
+    with safetensors.safe_open(path, framework="pt") as file:
+        return str(json.loads((file.metadata() or {})[KEY])["sha256"])
 
 
 _ADVICE = "Move it away and run again; the labels are then solved anew."

@@ -17,7 +17,7 @@ from hno.pontryagin.mesh import graded_mesh, label_places, label_times
 from hno.pontryagin.saturation import nodes_at_kinks
 from hno.pontryagin.starts import Search, Starts, find_starts
 from hno.pontryagin.sweep import costates, values
-from hno.types import Extremal, Status
+from hno.types import Extremal, Status, join
 
 
 class Solver(NamedTuple):
@@ -52,12 +52,6 @@ def solve(game: Game, x0: Tensor, theta: Tensor, settings: Solver = Solver()) ->
     game = copy.deepcopy(game).to(x0.device).double()
     parts = zip(x0.double().split(settings.chunk), theta.double().split(settings.chunk), strict=True)
     return join([_describe(game, solve_on_mesh(game, *part, settings), settings) for part in parts])
-
-
-def join(parts: list[Extremal]) -> Extremal:
-    """Extremals of one game, one after the other."""
-    batched = {name: torch.cat([getattr(part, name) for part in parts]) for name in Extremal._fields if name != "t"}
-    return Extremal(t=parts[0].t, **batched)
 
 
 def _check(game: Game, x0: Tensor, theta: Tensor) -> None:

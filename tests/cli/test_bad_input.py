@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from hno.data import datamodule
-from hno.data.generate import label_path
+from hno.data.labels import label_path
 from hno.games import make
 from hno.pontryagin import Solver
 from hno.types import Extremal

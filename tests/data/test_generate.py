@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from hno.data import generate
-from hno.data.generate import Request, default_cache, label_path, labels_for, start_states
+from hno.data.labels import Request, default_cache, label_path, labels_for, start_states
 from hno.data.store import LabelFileError
 from hno.games import Game, make
 from hno.pontryagin.solve import Solver

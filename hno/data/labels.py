@@ -1,0 +1,189 @@
+"""Labels on demand: start states by seed, solved where the cache lacks them."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import joblib
+import torch
+from torch import Tensor
+
+from hno.data.shards import SHARD, LabelSet
+from hno.data.store import canonical_json
+from hno.games import Game
+from hno.pontryagin.solve import Solver, solve
+from hno.types import Extremal, Status
+
+SOLVER_VERSION = 2
+"""Counted up when the solver's results change, which makes cached labels stale."""
+
+
+class Request(NamedTuple):
+    """A set of labels: `starts` start states of one type, drawn by `seed`."""
+
+    theta: tuple[float, ...]
+    """Player types."""
+    starts: int
+    """Number of start states."""
+    seed: int
+    """Seed of the start states."""
+    split: str
+    """What the states are for, "train" or "test": different splits never share states."""
+    widen: float = 1.0
+    """Width of the start box in units of the game's."""
+
+
+class Progress(NamedTuple):
+    """How far a generation is."""
+
+    done: int
+    """States solved in this run, failed ones included."""
+    total: int
+    """States to solve in this run."""
+    converged: int
+    """Converged ones among those that are done."""
+
+
+Report = Callable[[Progress], None]
+"""Called when labels have been written."""
+
+
+def default_cache() -> Path:
+    """$HNO_CACHE, or the user's cache folder."""
+    fallback = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "hno"
+    return Path(os.environ.get("HNO_CACHE", fallback))
+
+
+def start_states(game: Game, request: Request) -> Tensor:
+    """Uniform start states of a request, float64, (starts, P, n); more of them begin with the fewer."""
+    text = canonical_json({"seed": request.seed, "split": request.split, "theta": request.theta})
+    generator = torch.Generator().manual_seed(int(hashlib.sha256(text.encode()).hexdigest()[:15], 16))
+    return game.initial_box.widened(request.widen).cpu().sample(request.starts, generator).double()
+
+
+def label_set(game: Game, request: Request, cache: Path, settings: Solver = Solver()) -> LabelSet:
+    """Where a request's labels are; the folder's name holds a hash of everything that determines them."""
+    content = provenance(game, request, settings)
+    key = hashlib.sha256(canonical_json(content).encode()).hexdigest()[:16]
+    types = "-".join(f"{t:g}" for t in request.theta)
+    return LabelSet(cache / type(game).__name__ / f"{types}_{request.split}{request.seed}_{key}", content)
+
+
+def provenance(game: Game, request: Request, settings: Solver) -> dict[str, Any]:
+    """Everything that determines labels, but for how many there are: row k of a set is always the same."""
+    content = request._asdict()
+    del content["starts"]
+    return {
+        "game": type(game).__name__,
+        "constants": {name: _plain(value) for name, value in game.constants.items()},
+        "fingerprint": game.fingerprint(),
+        "request": content,
+        "solver": _plain(settings),
+        "solver_version": SOLVER_VERSION,
+    }
+
+
+def _plain(content: Any) -> Any:
+    if hasattr(content, "_asdict"):
+        return {name: _plain(value) for name, value in content._asdict().items()}
+    return [_plain(part) for part in content] if isinstance(content, (tuple, list)) else content
+
+
+def labels_for(
+    game: Game,
+    requests: Sequence[Request],
+    cache: Path,
+    settings: Solver = Solver(),
+    workers: int | None = None,
+    report: Report | None = None,
+) -> tuple[list[Extremal], float]:
+    """Labels of every request, read from the cache or solved and written to it, shard by shard.
+
+    Args:
+        game: the game.
+        requests: what is needed.
+        cache: folder of label sets.
+        settings: solver settings, part of the cache key.
+        workers: processes with one thread each; the number of cores by default.
+        report: called as labels are written.
+
+    Returns:
+        One `Extremal` per request, failed rows included, and the seconds spent on solving.
+
+    Raises:
+        LabelFileError: a cached file is damaged.
+        OSError: the cache cannot be written to.
+    """
+    began = time.perf_counter()
+    generate(game, requests, cache, settings, workers, report)
+    sets = [label_set(game, request, cache, settings) for request in requests]
+    found = [labels.read(request.starts) for labels, request in zip(sets, requests, strict=True)]
+    return found, time.perf_counter() - began
+
+
+class _Job(NamedTuple):
+    labels: LabelSet
+    shard: int
+    """Number of the shard."""
+    x0: Tensor
+    """Start states of the whole shard, as far as it is asked for."""
+    have: int
+    """Rows that the shard has already."""
+    theta: tuple[float, ...]
+
+
+def generate(
+    game: Game,
+    requests: Sequence[Request],
+    cache: Path,
+    settings: Solver = Solver(),
+    workers: int | None = None,
+    report: Report | None = None,
+) -> None:
+    """Solve what the cache lacks of some requests; arguments and errors as for `labels_for`."""
+    jobs = []
+    for request in requests:
+        labels = label_set(game, request, cache, settings)
+        for shard, x0 in enumerate(start_states(game, request).split(SHARD)):
+            have = len(labels.read_shard(shard).status) if labels.rows(shard) else 0  # reading verifies
+            if have < len(x0):
+                labels.check_writable()
+                jobs.append(_Job(labels, shard, x0, have, request.theta))
+    total, done, converged = sum(len(job.x0) - job.have for job in jobs), 0, 0
+    for status in _run(game, jobs, settings, workers):
+        done += len(status)
+        converged += int((status == Status.CONVERGED).sum())
+        if report is not None:
+            report(Progress(done, total, converged))
+    for labels in dict.fromkeys(label_set(game, request, cache, settings) for request in requests):
+        labels.write_manifest()
+
+
+def _run(game: Game, jobs: Sequence[_Job], settings: Solver, workers: int | None) -> Iterator[Tensor]:
+    """The status of every newly solved row, shard by shard."""
+    workers = min(workers or os.cpu_count() or 1, len(jobs))
+    if workers <= 1:
+        return (_solve_shard(game, job, settings) for job in jobs)
+    pool = joblib.Parallel(n_jobs=workers, return_as="generator_unordered", inner_max_num_threads=1, backend="loky")
+    return pool(joblib.delayed(_solve_alone)(game, job, settings) for job in jobs)  # type: ignore[no-any-return]
+
+
+def _solve_alone(game: Game, job: _Job, settings: Solver) -> Tensor:
+    torch.set_num_threads(1)
+    return _solve_shard(game, job, settings)
+
+
+def _solve_shard(game: Game, job: _Job, settings: Solver) -> Tensor:
+    """Solve the rows that a shard lacks and write it; another process may have done so meanwhile."""
+    have = job.labels.rows(job.shard)
+    x0 = job.x0[have:]
+    if len(x0) == 0:
+        return job.labels.read_shard(job.shard).status[job.have : len(job.x0)]
+    theta = torch.tensor(job.theta, dtype=torch.float64).expand(len(x0), -1)
+    job.labels.append(job.shard, have, solve(game, x0, theta, settings))
+    return job.labels.read_shard(job.shard).status[job.have : len(job.x0)]

@@ -1,0 +1,129 @@
+"""A set of labels as a folder of shards with a manifest, which several processes may fill at once."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import filelock
+
+from hno.data.store import LabelFileError, canonical_json, checksum, read_labels, replace_whole, row_count, write_labels
+from hno.data.trust import summary
+from hno.types import Extremal, join, part
+
+SHARD = 128
+"""Rows of a shard; the last one of a set may hold fewer until the set grows."""
+MANIFEST = "manifest.json"
+"""The manifest's name inside the folder of a set."""
+
+
+@dataclass(frozen=True)
+class LabelSet:
+    """Labels of one game, type and seed in files of `SHARD` rows, each written whole or not at all.
+
+    Args:
+        folder: where the shards are.
+        provenance: what determines the labels, JSON content.
+    """
+
+    folder: Path
+    provenance: Mapping[str, Any] = field(compare=False)
+
+    def path(self, shard: int) -> Path:
+        """File of a shard."""
+        return self.folder / f"shard-{shard:05}.safetensors"
+
+    def rows(self, shard: int) -> int:
+        """How many rows of a shard are there, by its header; its content is verified when it is read."""
+        path = self.path(shard)
+        return row_count(path) if path.exists() else 0
+
+    def read_shard(self, shard: int) -> Extremal:
+        """The rows of a shard.
+
+        Raises:
+            LabelFileError: damaged, or made by other settings than its folder says.
+        """
+        labels, provenance = read_labels(self.path(shard))
+        if canonical_json(provenance) != canonical_json(self.provenance):
+            raise LabelFileError(f"{self.path(shard)} was made by other settings than its folder says. Move it away.")
+        return labels
+
+    def read(self, starts: int) -> Extremal:
+        """The first rows of the set.
+
+        Raises:
+            LabelFileError: a shard is damaged, or there are fewer rows than asked for.
+        """
+        found = []
+        for shard in range((starts - 1) // SHARD + 1):
+            wanted = min(SHARD, starts - shard * SHARD)
+            labels = self.read_shard(shard)
+            if len(labels.status) < wanted:
+                raise LabelFileError(f"{self.path(shard)} holds {len(labels.status)} rows, expected {wanted}.")
+            found.append(part(labels, slice(wanted)))
+        return join(found)
+
+    def append(self, shard: int, have: int, labels: Extremal) -> None:
+        """Add rows to a shard that had `have` of them. Rows that another process added first are kept.
+
+        Raises:
+            LabelFileError: the shard has fewer rows than it had.
+        """
+        with self._lock():
+            now = self.rows(shard)
+            if now < have:
+                raise LabelFileError(f"{self.path(shard)} shrank from {have} to {now} rows. Run again.")
+            if now >= have + len(labels.status):
+                return
+            new = part(labels, slice(now - have, None))
+            write_labels(self.path(shard), join([self.read_shard(shard), new]) if now else new, self.provenance)
+
+    def write_manifest(self) -> None:
+        """Write down which shards there are, with their checksums and how far their labels can be trusted."""
+        if self._listed() == self._shards() and not self._drafts():
+            return
+        with self._lock():
+            for draft in self._drafts():  # left by a killed process: who writes holds the lock
+                draft.unlink()
+            shards = self._shards()
+            content = {
+                "provenance": self.provenance,
+                "versions": {name: version(name) for name in ("hno", "torch")},
+                "shards": shards,
+                "summary": summary(join([self.read_shard(shard) for shard in range(len(shards))])),
+            }
+            text = json.dumps(content, indent=1, sort_keys=True) + "\n"
+            replace_whole(self.folder / MANIFEST, lambda draft: draft.write_text(text))
+
+    def _shards(self) -> list[dict[str, Any]]:
+        paths = sorted(self.folder.glob("shard-*.safetensors"))
+        return [{"file": path.name, "rows": row_count(path), "sha256": checksum(path)} for path in paths]
+
+    def _drafts(self) -> list[Path]:
+        return sorted(self.folder.glob(".shard-*.*")) + sorted(self.folder.glob(f".{MANIFEST}.*"))
+
+    def _listed(self) -> Any:
+        try:
+            return json.loads((self.folder / MANIFEST).read_text())["shards"]
+        except (OSError, ValueError, KeyError, TypeError):
+            return None
+
+    def check_writable(self) -> None:
+        """Raise OSError, with advice, where the folder cannot be written to."""
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=self.folder):
+                pass
+        except OSError as error:
+            raise OSError(
+                f"Labels cannot be written to {self.folder} ({error}). Choose another folder with $HNO_CACHE."
+            ) from error
+
+    def _lock(self) -> filelock.BaseFileLock:
+        return filelock.FileLock(self.folder / ".lock")

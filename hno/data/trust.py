@@ -1,0 +1,49 @@
+"""What the certificates of a label set say, in numbers."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from hno.types import Extremal, Status
+
+LOCAL_GAP = 1e-4
+"""Best-response gap from the equilibrium itself above which a label is doubtful, relative."""
+GLOBAL_GAP = 1e-3
+"""Best-response gap from several manoeuvres above which an equilibrium is a local one, relative."""
+CLEARANCE = 0.02
+"""What a safe start's equilibrium keeps by default, m for distance constraints."""
+
+
+def safe(found: Extremal, clearance: float = CLEARANCE) -> Tensor:
+    """Starts whose equilibrium keeps a clearance, (B,)."""
+    return (found.status == Status.CONVERGED) & (found.clearance >= clearance)
+
+
+def inevitable(found: Extremal) -> Tensor:
+    """Starts whose equilibrium collides, (B,)."""
+    return (found.status == Status.CONVERGED) & (found.clearance <= 0)
+
+
+def summary(found: Extremal) -> dict[str, Any]:
+    """Counts and worst certificates of a label set, JSON content; numbers that do not exist are None."""
+    solved = found.status == Status.CONVERGED
+    local, total = found.local_gap.amax(-1), found.global_gap.amax(-1)
+    return {
+        "starts": len(found.status),
+        "status": {status.name.lower(): int((found.status == status).sum()) for status in Status},
+        "safe": int(safe(found).sum()),
+        "inevitable": int(inevitable(found).sum()),
+        "largest_residual": _largest(found.residual[solved]),
+        "largest_reintegration": _largest(found.reintegration[solved]),
+        "largest_local_gap": _largest(local[solved]),
+        "largest_global_gap": _largest(total[solved]),
+        "above_local_gap": int((solved & ~(local <= LOCAL_GAP)).sum()),
+        "above_global_gap": int((solved & ~(total <= GLOBAL_GAP)).sum()),
+    }
+
+
+def _largest(values: Tensor) -> float | None:
+    return float(values.nan_to_num(torch.inf).max()) if len(values) else None
