@@ -10,14 +10,18 @@ from hno.pontryagin.certificates import reintegration_error
 from hno.pontryagin.collocation import Collocation, Iterate, Newton, hermite, newton, rescue
 from hno.types import Status
 
+PARTS = (1, 8, 2, 4, 8)
+"""Into how many parts each pass splits the intervals with kinks."""
+
 
 def nodes_at_kinks(
-    game: Game, at: Iterate, residual: Tensor, status: Tensor, settings: Newton, tolerance: float, passes: int = 3
+    game: Game, at: Iterate, residual: Tensor, status: Tensor, settings: Newton, tolerance: float
 ) -> tuple[Iterate, Tensor, Tensor]:
     """Solve again with nodes where controls reach or leave their bounds, which restores the order of the method.
 
-    It concerns trajectories that stalled, and those whose re-integration misses the tolerance. What is not solved on
-    its new mesh stays as it was. Kinks move a little with the solution, hence several passes.
+    It concerns trajectories that stalled, and those whose re-integration error is not far below the tolerance. What is
+    not solved on its new mesh stays as it was. Kinks move with the solution: where one pass is not enough, the next ones
+    also split the intervals around them, more and less finely, because Newton may stall on one mesh and not on another.
 
     Args:
         game: the game, float64.
@@ -25,28 +29,27 @@ def nodes_at_kinks(
         residual: their residuals, (B,).
         status: their `Status`, (B,).
         settings: of Newton's method.
-        tolerance: re-integration error that is good enough, in widths of the PDE box.
-        passes: how often.
+        tolerance: largest re-integration error of a label, in widths of the PDE box.
 
     Returns:
         Trajectories, their residuals (B,) and `Status` (B,). Meshes are filled up with intervals of length 0 at the end.
     """
     equations, first = Collocation(game), at.t
     residual, status = residual.clone(), status.clone()
-    for turn in range(passes):
+    for turn, parts in enumerate(PARTS):
         drift = reintegration_error(game, at)
-        wanted = (status == Status.CONVERGED) & (drift > tolerance)
+        wanted = (status == Status.CONVERGED) & (drift > (tolerance / 2 if turn else tolerance / 100))
         if turn == 0:
             wanted |= status == Status.STALLED
         rows = wanted.nonzero().squeeze(-1)
         if len(rows) == 0:
             break
         part = at.rows(rows)
-        t = torch.cat([first[rows], saturation_times(game, part)], 1).sort(dim=-1).values
+        kinks = saturation_times(game, part)
+        t = torch.cat([first[rows], kinks, *_around(first[rows], kinks, parts)], 1).sort(dim=-1).values
         start = Iterate(t, equations.at_times(part, t), part.theta)
         found = newton(equations, start, settings)
-        if turn == 0:
-            found = rescue(equations, start, found, torch.arange(len(rows), device=rows.device), settings)
+        found = rescue(equations, start, found, torch.arange(len(rows), device=rows.device), settings)
         z, size, ended = found
         done = ended == Status.CONVERGED
         length = max(t.shape[1], at.t.shape[1])
@@ -56,6 +59,13 @@ def nodes_at_kinks(
     return at, residual, status
 
 
+def _around(t: Tensor, kinks: Tensor, parts: int) -> list[Tensor]:
+    """Nodes that split the intervals with kinks into equal parts."""
+    right = torch.searchsorted(t.contiguous(), kinks.contiguous()).clamp_min(1)
+    low, high = t.gather(1, right - 1), t.gather(1, right)
+    return [torch.lerp(low, high, k / parts) for k in range(1, parts)]
+
+
 def _lengthened(part: Tensor, length: int) -> Tensor:
     """The last node repeated until there are `length` nodes, a copy."""
     last = part[:, -1:].expand(-1, length - part.shape[1], *part.shape[2:])
@@ -63,7 +73,7 @@ def _lengthened(part: Tensor, length: int) -> Tensor:
 
 
 def saturation_times(game: Game, at: Iterate, bisections: int = 30) -> Tensor:
-    """Where a control reaches or leaves its bounds, at most once between a node and an interval's centre.
+    """Where a control leaves a bound or arrives at one, at most once each between a node and an interval's centre.
 
     Args:
         game: the game, float64.
@@ -76,20 +86,24 @@ def saturation_times(game: Game, at: Iterate, bisections: int = 30) -> Tensor:
     equations = Collocation(game)
     share = torch.tensor([0.0, 0.5, 1.0], dtype=at.z.dtype, device=at.z.device)
     side = _side(game, *equations.split(equations.interpolate(at, share)))
-    row, interval, half, player, channel = (side[:, :, 1:] != side[:, :, :-1]).nonzero().unbind(-1)
+    jump = side[:, :, 1:] - side[:, :, :-1]
+    leaving, crossing = (jump != 0).nonzero(), (jump.abs() == 2).nonzero()  # from bound to bound: two kinks
+    row, interval, half, player, channel = torch.cat([leaving, crossing]).unbind(-1)
+    arrives = torch.arange(len(row), device=row.device) >= len(leaving)
     rate = equations.rate(at.z, at.theta)
     ends = [part[row, interval + next_] for part in (at.z, rate) for next_ in (0, 1)]
     step = (at.t[row, interval + 1] - at.t[row, interval]).unsqueeze(-1)
     left, width = half / 2, 0.5
-    before = side[row, interval, half, player, channel]
+    wanted = side[row, interval, half + arrives, player, channel]
     cell = torch.arange(len(row), device=row.device)
     for _ in range(bisections):
         width /= 2
         inside = equations.split(hermite(*ends, step, (left + width).unsqueeze(-1)))
-        same = _side(game, *inside)[cell, player, channel] == before
-        left = torch.where(same, left + width, left)
+        before = (_side(game, *inside)[cell, player, channel] == wanted) != arrives
+        left = torch.where(before, left + width, left)
     t = at.t[row, interval] + (left + width / 2) * step.squeeze(-1)
-    return _padded(row, t, len(at.t), at.t[:, -1:])
+    order = row.argsort(stable=True)
+    return _padded(row[order], t[order], len(at.t), at.t[:, -1:])
 
 
 def _side(game: Game, x: Tensor, own: Tensor) -> Tensor:

@@ -99,9 +99,8 @@ def solve_on_mesh(game: Game, x0: Tensor, theta: Tensor, settings: Solver = Solv
         hopeless = place[tried & ~converged.any(1, keepdim=True)]
         found = rescue(equations, iterate, found, hopeless, settings.newton)
         best, totals = _best(_total(game, iterate._replace(z=found.z)), found, tried)
-        picked, drift = iterate._replace(z=found.z).rows(best), settings.reintegration / 100
-        again = nodes_at_kinks(game, picked, found.residual[best], found.status[best], settings.newton, drift)
-        return OnMesh(*again, totals)
+        picked, size, status = iterate._replace(z=found.z).rows(best), found.residual[best], found.status[best]
+        return OnMesh(*nodes_at_kinks(game, picked, size, status, settings.newton, settings.reintegration), totals)
 
 
 def _initial_iterate(game: Game, x: Tensor, u: Tensor, theta: Tensor, extra: int) -> Iterate:
