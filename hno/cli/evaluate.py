@@ -28,6 +28,7 @@ from hno.types import Extremal
 
 log = logging.getLogger(__name__)
 
+
 def main() -> None:
     """Entry point."""
     run_command("evaluate", evaluate)
@@ -70,7 +71,9 @@ def _run(config: DictConfig, results: Results) -> None:
     results.update(status="finished")
 
 
-def types_to_evaluate(text: str, policy: OperatorPolicy, unseen: Sequence[Sequence[float]] = ()) -> list[tuple[float, ...]]:
+def types_to_evaluate(
+    text: str, policy: OperatorPolicy, unseen: Sequence[Sequence[float]] = ()
+) -> list[tuple[float, ...]]:
     """Player types from "default", a named grid, or a list such as "1,1;2.5,4".
 
     Default are the labelled types, and those of `unseen` that lie in the game's type box.

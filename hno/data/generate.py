@@ -143,7 +143,16 @@ def progress_report(console: Console, every: float = 10.0) -> Iterator[Report]:
 
 def _table(game: Game, requests: Sequence[Request], rows: Sequence[dict[str, Any]]) -> Table:
     table = Table(title=f"{type(game).__name__}, split {requests[0].split}, seed {requests[0].seed}")
-    columns = ("theta", "starts", "converged", "inevitable collisions", "safe", "re-integration", "local gap", "global gap")
+    columns = (
+        "theta",
+        "starts",
+        "converged",
+        "inevitable collisions",
+        "safe",
+        "re-integration",
+        "local gap",
+        "global gap",
+    )
     for name in columns:
         table.add_column(name, justify="right")
     for request, row in zip(requests, rows, strict=True):

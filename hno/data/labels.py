@@ -170,7 +170,7 @@ def _run(game: Game, jobs: Sequence[_Job], settings: Solver, workers: int | None
     if workers <= 1:
         return (_solve_shard(game, job, settings) for job in jobs)
     pool = joblib.Parallel(n_jobs=workers, return_as="generator_unordered", inner_max_num_threads=1, backend="loky")
-    return pool(joblib.delayed(_solve_alone)(game, job, settings) for job in jobs)  # type: ignore[no-any-return]
+    return pool(joblib.delayed(_solve_alone)(game, job, settings) for job in jobs)
 
 
 def _solve_alone(game: Game, job: _Job, settings: Solver) -> Tensor:

@@ -88,17 +88,17 @@ class Collocation:
     def interpolate(self, at: Iterate, share: Tensor) -> Tensor:
         """The cubic Hermite interpolant at shares (S,) of every interval, (B, K - 1, S, D)."""
         rate = self.rate(at.z, at.theta)
-        ends = (part[:, nodes, None] for part in (at.z, rate) for nodes in (slice(None, -1), slice(1, None)))
-        return hermite(*ends, at.t.diff(dim=-1)[..., None, None], share.unsqueeze(-1))
+        ends = Ends(at.z[:, :-1, None], at.z[:, 1:, None], rate[:, :-1, None], rate[:, 1:, None])
+        return hermite(ends, at.t.diff(dim=-1)[..., None, None], share.unsqueeze(-1))
 
     def at_times(self, at: Iterate, t: Tensor) -> Tensor:
         """The same interpolant at times (B, M) of the mesh's span, (B, M, D)."""
         left = (torch.searchsorted(at.t.contiguous(), t.contiguous()) - 1).clamp_min(0)
         rows = torch.arange(len(t), device=t.device).unsqueeze(-1)
         rate = self.rate(at.z, at.theta)
-        ends = (part[rows, left + next_] for part in (at.z, rate) for next_ in (0, 1))
+        ends = Ends(at.z[rows, left], at.z[rows, left + 1], rate[rows, left], rate[rows, left + 1])
         step = at.t[rows, left + 1] - at.t[rows, left]
-        return hermite(*ends, step.unsqueeze(-1), ((t - at.t[rows, left]) / step).unsqueeze(-1))
+        return hermite(ends, step.unsqueeze(-1), ((t - at.t[rows, left]) / step).unsqueeze(-1))
 
     def defect(self, at: Iterate) -> Tensor:
         """Simpson defect of each interval, (B, K - 1, D)."""
@@ -151,10 +151,19 @@ class Collocation:
             return jacobian_rows(own_costate(target).flatten(-2), flat).movedim(0, -2)
 
 
-def hermite(before: Tensor, after: Tensor, rate: Tensor, rate_after: Tensor, step: Tensor, share: Tensor) -> Tensor:
+class Ends(NamedTuple):
+    """Unknowns and their rates at both ends of a step, tensors of one shape."""
+
+    before: Tensor
+    after: Tensor
+    rate_before: Tensor
+    rate_after: Tensor
+
+
+def hermite(ends: Ends, step: Tensor, share: Tensor) -> Tensor:
     """The cubic with given values and rates at both ends of a step, at a share of it."""
-    chord = before + (3 - 2 * share) * share**2 * (after - before)
-    return chord + step * share * (1 - share) * ((1 - share) * rate - share * rate_after)
+    chord = ends.before + (3 - 2 * share) * share**2 * (ends.after - ends.before)
+    return chord + step * share * (1 - share) * ((1 - share) * ends.rate_before - share * ends.rate_after)
 
 
 class Elimination(NamedTuple):
@@ -186,7 +195,9 @@ class Elimination(NamedTuple):
         offsets = []
         for k in reversed(range(defect.shape[1])):
             known = defect[:, k] + _apply(self.ahead[:, k], shift)
-            offsets.append(-torch.linalg.lu_solve(self.factors[:, k], self.pivots[:, k], known.unsqueeze(-1)).squeeze(-1))
+            offsets.append(
+                -torch.linalg.lu_solve(self.factors[:, k], self.pivots[:, k], known.unsqueeze(-1)).squeeze(-1)
+            )
             shift = offsets[-1][:, :half]
         end, state, step = -terminal_defect.to(self.end.dtype), torch.zeros_like(shift), []
         for k, offset in enumerate(reversed(offsets)):
@@ -208,8 +219,8 @@ def eliminate(left: Tensor, right: Tensor, end: Tensor) -> Elimination:
         factors.append(factor)
         pivots.append(pivot)
         slope = slopes[-1][:, :half]
-    parts = (torch.stack(part[::-1], 1) for part in (factors, pivots, slopes))
-    return Elimination(*parts, right[..., half:].contiguous(), end)
+    stacked = [torch.stack(part[::-1], 1) for part in (factors, pivots, slopes)]
+    return Elimination(stacked[0], stacked[1], stacked[2], right[..., half:].contiguous(), end)
 
 
 def _apply(matrix: Tensor, vector: Tensor) -> Tensor:
@@ -277,9 +288,7 @@ def _direction(equations: Collocation, system: Elimination, at: Iterate) -> Tens
     return system.solve(equations.defect(at), equations.terminal_defect(at)).to(at.z.dtype).nan_to_num(0, 0, 0)
 
 
-def _damped_steps(
-    equations: Collocation, rough: Collocation, start: Iterate, settings: Newton
-) -> Solved:
+def _damped_steps(equations: Collocation, rough: Collocation, start: Iterate, settings: Newton) -> Solved:
     """Newton with a line search."""
     z, residual = start.z.clone(), equations.residual(start)
     status = torch.full_like(residual, Status.MAX_STEPS, dtype=torch.int64)

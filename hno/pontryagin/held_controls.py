@@ -1,4 +1,4 @@
-"""Optimal control problems over held controls: the joint problem that starts the search, and one player's best response.
+"""Optimal control problems over held controls: the joint one that starts the search, and a player's best response.
 
 When the players' constraints are one function, their penalty is shared: a stationary point of the joint cost (efforts,
 terminal costs and the penalty once) is then an open-loop equilibrium. In any other game it is a good start.
@@ -16,7 +16,7 @@ from hno.pontryagin.adjoint import gradient_of, jacobian_rows
 from hno.pontryagin.integrate import runge_kutta
 
 BLOCK = 8192
-"""Time steps that are expanded together: few enough for the processor's cache."""
+"""Penalty points that are evaluated together: few enough for the processor's cache."""
 
 
 class Expansion(NamedTuple):
@@ -76,8 +76,8 @@ class HeldControls:
     def rows(self, index: Tensor) -> HeldControls:
         """The same problem for the rows at `index`."""
         ego = None if self.ego is None else self.ego[index]
-        options = {"margin": self.margin, "points": self.points}
-        return HeldControls(self.game, self.t[index], self.theta[index], ego=ego, **options)
+        t, theta = self.t[index], self.theta[index]
+        return HeldControls(self.game, t, theta, ego=ego, margin=self.margin, points=self.points)
 
     def control(self, v: Tensor) -> Tensor:
         """Physical controls, (..., P, m)."""
@@ -104,7 +104,9 @@ class HeldControls:
         return torch.cat([part._cost_block(x[index], v[index]) for index, part in self._blocks()])
 
     def _blocks(self) -> list[tuple[Tensor, HeldControls]]:
-        index = torch.arange(len(self.theta), device=self.theta.device).split(max(1, BLOCK // self.steps // self.points))
+        index = torch.arange(len(self.theta), device=self.theta.device).split(
+            max(1, BLOCK // self.steps // self.points)
+        )
         return [(part, self.rows(part)) for part in index]
 
     def _cost_block(self, x: Tensor, v: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from hno.games import Game
 from hno.pontryagin.certificates import reintegration_error
-from hno.pontryagin.collocation import Collocation, Iterate, Newton, hermite, newton, rescue
+from hno.pontryagin.collocation import Collocation, Ends, Iterate, Newton, hermite, newton, rescue
 from hno.types import Status
 
 PARTS = (1, 8, 2, 4, 8)
@@ -20,8 +20,9 @@ def nodes_at_kinks(
     """Solve again with nodes where controls reach or leave their bounds, which restores the order of the method.
 
     It concerns trajectories that stalled, and those whose re-integration error is not far below the tolerance. What is
-    not solved on its new mesh stays as it was. Kinks move with the solution: where one pass is not enough, the next ones
-    also split the intervals around them, more and less finely, because Newton may stall on one mesh and not on another.
+    not solved on its new mesh stays as it was. Kinks move with the solution: where one pass is not enough, the next
+    ones also split the intervals around them, more and less finely, because Newton may stall on one mesh and not on
+    another.
 
     Args:
         game: the game, float64.
@@ -32,7 +33,7 @@ def nodes_at_kinks(
         tolerance: largest re-integration error of a label, in widths of the PDE box.
 
     Returns:
-        Trajectories, their residuals (B,) and `Status` (B,). Meshes are filled up with intervals of length 0 at the end.
+        Trajectories, their residuals (B,) and `Status` (B,). Meshes are filled up with intervals of length 0.
     """
     equations, first = Collocation(game), at.t
     residual, status = residual.clone(), status.clone()
@@ -91,14 +92,14 @@ def saturation_times(game: Game, at: Iterate, bisections: int = 30) -> Tensor:
     row, interval, half, player, channel = torch.cat([leaving, crossing]).unbind(-1)
     arrives = torch.arange(len(row), device=row.device) >= len(leaving)
     rate = equations.rate(at.z, at.theta)
-    ends = [part[row, interval + next_] for part in (at.z, rate) for next_ in (0, 1)]
+    ends = Ends(at.z[row, interval], at.z[row, interval + 1], rate[row, interval], rate[row, interval + 1])
     step = (at.t[row, interval + 1] - at.t[row, interval]).unsqueeze(-1)
     left, width = half / 2, 0.5
     wanted = side[row, interval, half + arrives, player, channel]
     cell = torch.arange(len(row), device=row.device)
     for _ in range(bisections):
         width /= 2
-        inside = equations.split(hermite(*ends, step, (left + width).unsqueeze(-1)))
+        inside = equations.split(hermite(ends, step, (left + width).unsqueeze(-1)))
         before = (_side(game, *inside)[cell, player, channel] == wanted) != arrives
         left = torch.where(before, left + width, left)
     t = at.t[row, interval] + (left + width / 2) * step.squeeze(-1)

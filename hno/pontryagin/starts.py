@@ -59,15 +59,13 @@ def find_starts(game: Game, start: Tensor, theta: Tensor, search: Search) -> Sta
     shapes = manoeuvres(game, game.players, dtype=start.dtype, device=start.device)[:, nodes]
     size, count = len(start), len(shapes)
     rows = torch.arange(size, device=start.device).repeat_interleave(count)
-    options = {"margin": search.margin, "points": search.points * search.coarse}
-    guarded = HeldControls(game, times, theta[rows], **options)
+    guarded = HeldControls(game, times, theta[rows], margin=search.margin, points=search.points * search.coarse)
     base = at_rest(guarded, start[rows]).unsqueeze(1).expand(-1, len(nodes), -1, -1)
     v, _ = best_amplitude(guarded, start[rows], base, shapes.repeat(size, 1, 1, 1), search.amplitudes)
     for iterations, kept in search.rounds:
-        guarded = HeldControls(game, times, theta[rows], **options)
         x, v, cost = descend(guarded, start[rows], v, iterations, search.tolerance)
         best = _cheapest(x, cost, size)[1][:, :kept].flatten()
-        rows, v = rows[best], v[best]
+        rows, v, guarded = rows[best], v[best], guarded.rows(best)
     exact = HeldControls(game, t, theta[rows], points=search.points)
     v = v.repeat_interleave(search.coarse, 1)[:, : exact.steps]
     x, v, cost = descend(exact, start[rows], v, search.fine_iterations, search.tolerance)
@@ -78,8 +76,8 @@ def find_starts(game: Game, start: Tensor, theta: Tensor, search: Search) -> Sta
 def manoeuvres(game: Game, players: int, *, dtype: torch.dtype, device: torch.device) -> Tensor:
     """Shapes of evasive manoeuvres in scaled controls: out and back, per channel and sign pattern, (S, N, P, m).
 
-    One channel at a time, every player goes one way or the other; the first shape is no manoeuvre at all. With one player
-    the last axis but one has length 1 and fits any player.
+    One channel at a time, every player goes one way or the other; the first shape is no manoeuvre at all. With
+    `players` = 1 the shapes fit any one player.
     """
     steps = round(game.horizon / game.label_step)
     wave = torch.sin(2 * torch.pi * (torch.arange(steps, dtype=dtype, device=device) + 0.5) / steps)
