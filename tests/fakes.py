@@ -52,5 +52,8 @@ def fake_labels(
         value=-normal(count, nodes, players).abs(),
         theta=torch.tensor(theta, dtype=torch.float64).expand(count, -1).contiguous(),
         clearance=torch.tensor(clearance or [1.0] * count, dtype=torch.float64),
+        reintegration=normal(count).abs() * 1e-6,
+        local_gap=normal(count, players).abs() * 1e-6,
+        global_gap=normal(count, players).abs() * 1e-6,
         alternatives=normal(count, 3),
     )

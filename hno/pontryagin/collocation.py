@@ -330,9 +330,12 @@ def _line_search(
 def _reuse(
     equations: Collocation, system: Elimination, at: Iterate, residual: Tensor, rows: Tensor, settings: Newton
 ) -> None:
-    """Further steps with the same derivatives, in place, for as long as they cut the residual to a fifth."""
+    """Further steps with the same derivatives, in place, for as long as they cut the residual to a fifth.
+
+    They are cheap, so they go on to a hundredth of the tolerance.
+    """
     for _ in range(settings.reuses):
-        rows = rows[residual[rows] > settings.tolerance]
+        rows = rows[residual[rows] > settings.tolerance / 100]
         if len(rows) == 0:
             break
         part = at.rows(rows)

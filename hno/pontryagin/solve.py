@@ -89,6 +89,7 @@ def solve_on_mesh(game: Game, x0: Tensor, theta: Tensor, settings: Solver = Solv
     with torch.no_grad():
         starts = find_starts(copy.deepcopy(game).float(), x0.float(), theta.float(), settings.search)
         starts = Starts(*(part.double() for part in starts))
+        starts.x[:, :, 0] = x0.unsqueeze(1)  # single precision is for the search only
         tried = starts.cost.isfinite()
         tried[:, 0] = True  # where no start is finite, one fails in Newton and carries the status
         row, column = tried.nonzero().unbind(-1)
