@@ -44,7 +44,7 @@ def check_numbers(config: DictConfig) -> None:
         raise ValueError(f"optimizer.lr must be a positive number; got {config.optimizer.lr!r}.")
     if not (isinstance(config.seed, int) and config.seed >= 0):
         raise ValueError(f"seed must be a whole number of at least 0; got {config.seed!r}.")
-    for name, needed in (("data.types", True), ("evaluation.types", False)):
+    for name, needed in (("data.types", not config.data.files), ("evaluation.types", False)):
         value = OmegaConf.select(config, name)
         if not OmegaConf.is_list(value) or (needed and not value):
             raise ValueError(f"{name} must list player types, such as [[1, 1], [5, 5]]; got {value!r}.")
@@ -93,6 +93,7 @@ def build_data(config: DictConfig, operator: ValueOperator, report: Report | Non
         interior_types=data.interior_types,
         validation=data.validation,
         workers=data.workers,
+        files=[Path(file) for file in data.files],
         report=report,
     )
 

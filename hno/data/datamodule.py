@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, IterableDataset
 
 from hno.data.curriculum import Curriculum
+from hno.data.exchange import read_own
 from hno.data.labels import Report, Request, labels_for
 from hno.data.sampling import check_shares, sample_states
 from hno.games import Game
@@ -86,6 +87,7 @@ class GameData(L.LightningDataModule):
         validation: trajectories per type that are held out.
         solver: settings of the label solver.
         workers: label processes; the number of cores by default.
+        files: label files of your own, see `hno.data.exchange`; their types count as labelled.
         report: called as labels are written.
     """
 
@@ -104,6 +106,7 @@ class GameData(L.LightningDataModule):
         validation: int = 8,
         solver: Solver = Solver(),
         workers: int | None = None,
+        files: Sequence[Path] = (),
         report: Report | None = None,
     ) -> None:
         super().__init__()
@@ -119,12 +122,19 @@ class GameData(L.LightningDataModule):
                 raise ValueError(f"The number of rows or trajectories {name!r} must be at least 1; got {size}.")
         self.game = copy.deepcopy(game)  # the operator moves its own to a device; batches are made on the CPU
         self.streams, self.seed = frozenset(streams), seed
-        self.type_list = [tuple(map(float, theta)) for theta in types]
+        self.own = [read_own(path, game) for path in files]
+        solved = [tuple(map(float, theta)) for theta in types]
+        brought = [tuple(theta) for labels in self.own for theta in labels.theta.unique(dim=0).tolist()]
+        self.type_list = list(dict.fromkeys([*solved, *brought]))
+        if not self.type_list:
+            raise ValueError(
+                "There are no labelled types: name some in data.types, or files of your own in data.files."
+            )
         self.types = torch.tensor(self.type_list)
         self.batch_sizes, self.curriculum, self.shares = dict(batch_sizes), curriculum, dict(shares)
         self.interior_types, self.cache, self.solver, self.workers = interior_types, cache, solver, workers
         self.report = report
-        self.requests = [Request(theta, trajectories + validation, seed, "train") for theta in self.type_list]
+        self.requests = [Request(theta, trajectories + validation, seed, "train") for theta in solved]
         self.validation = validation
         self.label_seconds = 0.0
         self.extremals: list[Extremal] = []
@@ -134,12 +144,13 @@ class GameData(L.LightningDataModule):
         if self.extremals:
             return
         arguments = self.game, self.requests, self.cache, self.solver, self.workers, self.report
-        self.extremals, self.label_seconds = labels_for(*arguments)
+        found, self.label_seconds = labels_for(*arguments)
+        self.extremals = [*found, *self.own]
 
     def setup(self, stage: str) -> None:
         """Load labels into memory."""
         if not self.extremals:
-            self.extremals, _ = labels_for(self.game, self.requests, self.cache, self.solver, self.workers)
+            self.prepare_data()
         held_out = -self.validation
         self.train_rows = rows_of(self.game, [part(found, slice(held_out)) for found in self.extremals])
         self.val_rows = rows_of(self.game, [part(found, slice(held_out, None)) for found in self.extremals])

@@ -12,7 +12,7 @@ from hno.pontryagin.collocation import Collocation, Iterate
 from hno.pontryagin.descent import descend
 from hno.pontryagin.held_controls import HeldControls
 from hno.pontryagin.integrate import runge_kutta
-from hno.pontryagin.mesh import label_times
+from hno.pontryagin.mesh import label_places, label_times
 from hno.pontryagin.starts import Search, at_rest, best_amplitude, manoeuvres
 
 
@@ -77,14 +77,15 @@ def local_gap(game: Game, at: Iterate, iterations: int = 10) -> Tensor:
 
 
 def global_gap(
-    game: Game, x0: Tensor, u: Tensor, theta: Tensor, search: Search, iterations: int = 8, kept: int = 2
+    game: Game, x0: Tensor, t: Tensor, u: Tensor, theta: Tensor, search: Search, iterations: int = 8, kept: int = 2
 ) -> Tensor:
     """What each player gains when it re-optimises from several manoeuvres of its own.
 
     Args:
         game: the game.
         x0: start states, (B, P, n).
-        u: controls of the solution at the label nodes, (B, L, P, m).
+        t: times, s, (K,).
+        u: controls of the solution at these times, (B, K, P, m).
         theta: player types, (B, P).
         search: amplitudes of the manoeuvres, and how coarse the controls are.
         iterations: budget of the descents.
@@ -96,12 +97,12 @@ def global_gap(
     """
     game = copy.deepcopy(game).float()
     x0, u, theta = x0.float(), u.float(), theta.float()
-    t = label_times(game, dtype=theta.dtype, device=theta.device)
-    nodes = torch.arange(0, len(t) - 1, search.coarse, device=theta.device)
-    points = search.points * search.coarse
-    alone, rows = _each_alone(game, torch.cat([t[nodes], t[-1:]]), theta, points=points)
+    labels = label_times(game, dtype=theta.dtype, device=theta.device)
+    nodes = torch.arange(0, len(labels) - 1, search.coarse, device=theta.device)
+    times = torch.cat([labels[nodes], labels[-1:]])
+    alone, rows = _each_alone(game, times, theta, points=search.points * search.coarse)
     start = x0[rows]
-    own = alone.scaled(u)[rows][:, nodes].clamp(-1, 1)
+    own = alone.scaled(u)[rows][:, label_places(t.float().unsqueeze(0), times[:-1])[0]].clamp(-1, 1)
     shapes = manoeuvres(game, 1, dtype=theta.dtype, device=theta.device)[:, nodes] * alone.acts[:, None, None, :, None]
     rest = torch.where(alone.acts[:, None, :, None] > 0, at_rest(alone, start).unsqueeze(1), own)
     many = torch.arange(len(rows), device=theta.device).repeat_interleave(shapes.shape[1])

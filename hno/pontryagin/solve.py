@@ -204,6 +204,6 @@ def _describe(game: Game, found: OnMesh, settings: Solver) -> Extremal:
         clearance=clearance,
         reintegration=drift,
         local_gap=local_gap(game, at),
-        global_gap=global_gap(game, x[:, 0], u, at.theta, settings.search),
+        global_gap=global_gap(game, x[:, 0], t, u, at.theta, settings.search),
         alternatives=totals,
     )

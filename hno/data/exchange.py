@@ -1,0 +1,129 @@
+"""Labels from and to other programs, as arrays."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from hno.data.store import LabelFileError, read_labels, write_labels
+from hno.games import Game
+from hno.games.base import own_costate
+from hno.pontryagin.certificates import global_gap, local_gap, reintegration_error
+from hno.pontryagin.collocation import Collocation, Iterate
+from hno.pontryagin.starts import Search
+from hno.types import Extremal, Status
+
+REQUIRED = ("t", "x", "costate", "value", "theta")
+"""Arrays that labels of your own must have; shapes and units are those of `hno.types.Extremal`."""
+
+
+def to_arrays(labels: Extremal) -> dict[str, NDArray[Any]]:
+    """Labels as arrays, one per field of `hno.types.Extremal`."""
+    return {name: tensor.numpy() for name, tensor in labels._asdict().items()}
+
+
+def from_arrays(game: Game, arrays: Mapping[str, NDArray[Any]]) -> Extremal:
+    """Labels from arrays, with certificates that are computed here.
+
+    The re-integration error and the gaps see the trajectory as the cubic Hermite interpolant of its nodes: on a coarse
+    grid they are larger than those of the program that the labels come from.
+
+    Args:
+        game: the game that the labels are of.
+        arrays: at least `REQUIRED`; controls follow from the costates, and every row counts as converged.
+
+    Raises:
+        ValueError: a missing or unknown array, a wrong shape, numbers that are not finite, times that do not increase
+            from 0 to the horizon, or values that do not end at the terminal value.
+    """
+    game = copy.deepcopy(game).cpu().double()
+    wrong = [name for name in REQUIRED if name not in arrays] + [name for name in arrays if name not in REQUIRED]
+    if wrong:
+        raise ValueError(f"Labels consist of the arrays {', '.join(REQUIRED)}; missing or unknown: {', '.join(wrong)}.")
+    t, x, costate, value, theta = (torch.from_numpy(np.array(arrays[name], dtype=np.float64)) for name in REQUIRED)
+    _check(game, t, x, costate, value, theta)
+    own = own_costate(costate)
+    with torch.no_grad():
+        u = game.best_response(x, own)
+        at = Iterate(t.expand(len(x), -1), torch.cat([x.flatten(-2), own.flatten(-2)], -1), theta)
+        equations, share = Collocation(game), torch.linspace(0, 1, 9, dtype=t.dtype)
+        between = equations.split(equations.interpolate(at, share))[0].flatten(1, 2)
+        along = theta.unsqueeze(1).expand(between.shape[:-1])
+        return Extremal(
+            status=torch.full((len(x),), int(Status.CONVERGED)),
+            residual=torch.full((len(x),), torch.nan, dtype=torch.float64),
+            t=t,
+            x=x,
+            costate=costate,
+            u=u,
+            value=value,
+            theta=theta,
+            clearance=-game.constraint(between, along).amax((1, 2)),
+            reintegration=reintegration_error(game, at),
+            local_gap=local_gap(game, at),
+            global_gap=global_gap(game, x[:, 0], t, u, theta, Search()),
+            alternatives=value[:, 0].sum(-1, keepdim=True),
+        )
+
+
+def _check(game: Game, t: Tensor, x: Tensor, costate: Tensor, value: Tensor, theta: Tensor) -> None:
+    rows, nodes, players, states = len(x), len(t), game.players, game.state_dim
+    shapes = {
+        "t": (t, (nodes,)),
+        "x": (x, (rows, nodes, players, states)),
+        "costate": (costate, (rows, nodes, players, players, states)),
+        "value": (value, (rows, nodes, players)),
+        "theta": (theta, (rows, players)),
+    }
+    for name, (tensor, expected) in shapes.items():
+        if tuple(tensor.shape) != expected or tensor.numel() == 0:
+            raise ValueError(f"{name} must have shape {expected}, with rows; got {tuple(tensor.shape)}.")
+        if not bool(tensor.isfinite().all()):
+            raise ValueError(f"{name} has entries that are not finite.")
+    if nodes < 2 or bool((t.diff() <= 0).any()) or abs(float(t[0])) > 1e-9 or abs(float(t[-1]) - game.horizon) > 1e-9:
+        raise ValueError(f"t must increase from 0 to the horizon, {game.horizon} s; got {t.tolist()}.")
+    end = game.terminal_value(x[:, -1])
+    if not torch.allclose(value[:, -1], end, rtol=1e-3, atol=1e-3 * float(value.abs().max())):
+        worst = float((value[:, -1] - end).abs().max())
+        raise ValueError(
+            f"value must end at the game's terminal value -g, it is off by up to {worst:.3g}: values are V = -J, in "
+            "reward form, and x is in physical units."
+        )
+
+
+def write_own(path: Path, game: Game, labels: Extremal, source: str) -> None:
+    """Write labels to a file that `data.files` takes.
+
+    Args:
+        path: the file.
+        game: the game that the labels are of.
+        labels: what `from_arrays` gives.
+        source: where they come from, in words.
+    """
+    write_labels(path, labels, {**_identity(game), "source": source})
+
+
+def read_own(path: Path, game: Game) -> Extremal:
+    """Read labels that `write_own` or the label cache wrote.
+
+    Raises:
+        LabelFileError: damaged, or labels of another game or of other constants.
+    """
+    labels, provenance = read_labels(path)
+    found = {name: provenance.get(name) for name in ("game", "fingerprint")}
+    if found != _identity(game):
+        raise LabelFileError(
+            f"{path} holds labels of {found['game']} with other physics than {type(game).__name__} here."
+        )
+    return labels
+
+
+def _identity(game: Game) -> dict[str, str]:
+    return {"game": type(game).__name__, "fingerprint": game.fingerprint()}
