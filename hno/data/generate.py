@@ -19,7 +19,7 @@ from rich.table import Table
 from hno.data import labels as label_data
 from hno.data.labels import Report, Request, default_cache, label_set, labels_for
 from hno.data.store import LabelFileError
-from hno.data.trust import summary
+from hno.data.trust import GLOBAL_GAP, LOCAL_GAP, summary
 from hno.games import Game, make
 from hno.games.grid import parse_types
 from hno.types import Status
@@ -88,18 +88,20 @@ def read_options(given: Sequence[str]) -> DictConfig:
         raise ValueError(f"{what} Options are written as name=value: {', '.join(DEFAULTS)}.")
     for name, least in (("n", 1), ("seed", 0), ("workers", 1)):
         value = merged[name]
-        if not (isinstance(value, int) and value >= least) and not (name == "workers" and value is None):
+        if not (type(value) is int and value >= least) and not (name == "workers" and value is None):
             raise ValueError(f"{name} must be a whole number of at least {least}; got {value!r}.")
     if merged.split not in ("train", "test"):
         raise ValueError(f"split must be train or test; got {merged.split!r}.")
-    if not (isinstance(merged.widen, (int, float)) and 0 < merged.widen < float("inf")):
+    if not (type(merged.widen) in (int, float) and 0 < merged.widen < float("inf")):
         raise ValueError(f"widen must be a positive number; got {merged.widen!r}.")
+    if not isinstance(merged.constants, DictConfig):
+        raise ValueError(f"constants are written one by one, constants.<name>=<value>; got {merged.constants!r}.")
     return merged
 
 
 def run(options: DictConfig) -> None:
     """Generate, and print a table and where the sets are."""
-    game = make(options.game, **{str(name): value for name, value in options.constants.items()})
+    game = make(str(options.game), **{str(name): value for name, value in options.constants.items()})
     cache = default_cache() if options.cache is None else Path(options.cache)
     requests = [
         Request(theta, options.n, options.seed, options.split, float(options.widen))
@@ -110,6 +112,7 @@ def run(options: DictConfig) -> None:
         found, seconds = labels_for(game, requests, cache, workers=options.workers, report=report)
     rows = [summary(labels) for labels in found]
     console.print(_table(game, requests, rows))
+    console.print(_total(rows), highlight=False)
     for status in Status:
         count = sum(row["status"][status.name.lower()] for row in rows)
         if count and status != Status.CONVERGED:
@@ -139,6 +142,22 @@ def progress_report(console: Console, every: float = 10.0) -> Iterator[Report]:
                 print(f"{now.done} of {now.total}: {text}, {left:.0f} s left", flush=True)
 
         yield say
+
+
+def _total(rows: Sequence[dict[str, Any]]) -> str:
+    """One sentence over all types."""
+    starts, converged, local, wide = (
+        sum(counts)
+        for counts in zip(
+            *((r["starts"], r["status"]["converged"], r["above_local_gap"], r["above_global_gap"]) for r in rows),
+            strict=True,
+        )
+    )
+    least = min(row["status"]["converged"] / row["starts"] for row in rows)
+    return (
+        f"{converged:,} of {starts:,} converged ({converged / starts:.2%}, at least {least:.1%} at a type); best-response "
+        f"gap above {LOCAL_GAP:g} from the equilibrium itself: {local}, above {GLOBAL_GAP:g} from several starts: {wide}."
+    )
 
 
 def _table(game: Game, requests: Sequence[Request], rows: Sequence[dict[str, Any]]) -> Table:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import inspect
 import os
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -80,12 +81,19 @@ def provenance(game: Game, request: Request, settings: Solver) -> dict[str, Any]
     del content["starts"]
     return {
         "game": type(game).__name__,
-        "constants": {name: _plain(value) for name, value in game.constants.items()},
+        "constants": _changed_constants(game),
         "fingerprint": game.fingerprint(),
         "request": content,
         "solver": _plain(settings),
         "solver_version": SOLVER_VERSION,
     }
+
+
+def _changed_constants(game: Game) -> dict[str, Any]:
+    """Constants that differ from the game's defaults, in full precision, which fingerprints do not have."""
+    defaults = inspect.signature(type(game)).parameters
+    changed = {name: value for name, value in game.constants.items() if value != defaults[name].default}
+    return {name: list(map(float, v)) if isinstance(v, Sequence) else float(v) for name, v in changed.items()}
 
 
 def _plain(content: Any) -> Any:

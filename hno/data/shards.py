@@ -92,11 +92,12 @@ class LabelSet:
             for draft in self._drafts():  # left by a killed process: who writes holds the lock
                 draft.unlink()
             shards = self._shards()
+            found = [self.read_shard(_number(shard["file"])) for shard in shards]
             content = {
                 "provenance": self.provenance,
                 "versions": {name: version(name) for name in ("hno", "torch")},
                 "shards": shards,
-                "summary": summary(join([self.read_shard(shard) for shard in range(len(shards))])),
+                "summary": summary(join(found)),
             }
             text = json.dumps(content, indent=1, sort_keys=True) + "\n"
             replace_whole(self.folder / MANIFEST, lambda draft: draft.write_text(text))
@@ -127,3 +128,8 @@ class LabelSet:
 
     def _lock(self) -> filelock.BaseFileLock:
         return filelock.FileLock(self.folder / ".lock")
+
+
+def _number(name: str) -> int:
+    """Number of the shard in a file; a killed run may have left gaps between them."""
+    return int(name.removeprefix("shard-").removesuffix(".safetensors"))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from hno.types import Extremal, Status
@@ -46,4 +45,4 @@ def summary(found: Extremal) -> dict[str, Any]:
 
 
 def _largest(values: Tensor) -> float | None:
-    return float(values.nan_to_num(torch.inf).max()) if len(values) else None
+    return float(values.max()) if len(values) and bool(values.isfinite().all()) else None

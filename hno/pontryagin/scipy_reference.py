@@ -14,6 +14,7 @@ from torch import Tensor
 from hno.games import Game
 from hno.games.base import own_costate
 from hno.pontryagin.adjoint import pmp_rate, terminal_costate
+from hno.pontryagin.collocation import Iterate
 from hno.pontryagin.held_controls import HeldControls
 from hno.pontryagin.mesh import label_times
 from hno.pontryagin.starts import manoeuvres
@@ -31,12 +32,22 @@ class Reference(NamedTuple):
     """States on the label grid, (K, P, n)."""
     own: Tensor
     """Own costates on the label grid, (K, P, n)."""
+    path: Iterate
+    """The same on a fine uniform grid, one row."""
 
 
 def solve_one(
     game: Game, x0: Tensor, theta: Tensor, starts: int = 4, amplitude: float = 0.06, tolerance: float = 5e-3
 ) -> Reference:
-    """Solve Pontryagin's conditions from one start state.
+    """The cheapest of several attempts at Pontryagin's conditions from one start state; arguments as for `attempts`."""
+    found = attempts(game, x0, theta, starts, amplitude, tolerance)
+    return max(found, key=lambda attempt: float(attempt.value.sum().nan_to_num(-torch.inf)))
+
+
+def attempts(
+    game: Game, x0: Tensor, theta: Tensor, starts: int = 4, amplitude: float = 0.06, tolerance: float = 5e-3
+) -> list[Reference]:
+    """Solve Pontryagin's conditions from one start state and several manoeuvres.
 
     Args:
         game: the game.
@@ -50,8 +61,7 @@ def solve_one(
     x0, theta = x0.double(), theta.double()
     t = label_times(game, dtype=x0.dtype, device=x0.device)
     shapes = manoeuvres(game, game.players, dtype=x0.dtype, device=x0.device)[1 : starts + 1]
-    attempts = [_attempt(game, x0, theta, t, amplitude * shape, tolerance) for shape in shapes]
-    return max(attempts, key=lambda attempt: float(attempt.value.sum().nan_to_num(-torch.inf)))
+    return [_attempt(game, x0, theta, t, amplitude * shape, tolerance) for shape in shapes]
 
 
 def _attempt(game: Game, x0: Tensor, theta: Tensor, t: Tensor, shape: Tensor, tolerance: float) -> Reference:
@@ -76,8 +86,11 @@ def _attempt(game: Game, x0: Tensor, theta: Tensor, t: Tensor, shape: Tensor, to
     found = solve_bvp(rate, boundary, t.numpy(), guess, tol=tolerance, max_nodes=5000)
     x, costate = split(found.sol(t.numpy()))
     fine = np.linspace(0, game.horizon, 4001)
-    value = _value(game, torch.from_numpy(fine), *split(found.sol(fine)), theta)
-    return Reference(found.success, value if found.success else torch.full_like(value, torch.nan), x, costate)
+    samples, states = torch.from_numpy(fine), found.sol(fine)
+    value = _value(game, samples, *split(states), theta)
+    joint = torch.from_numpy(np.ascontiguousarray(states.T))[::4]
+    path = Iterate(samples[None, ::4], joint.unsqueeze(0), theta.unsqueeze(0))
+    return Reference(found.success, value if found.success else torch.full_like(value, torch.nan), x, costate, path)
 
 
 def _initial_guess(game: Game, x0: Tensor, theta: Tensor, t: Tensor, shape: Tensor) -> tuple[Tensor, Tensor]:

@@ -135,7 +135,7 @@ def _encounter_weight(game: Game, labels: Tensor, x: Tensor, u: Tensor, theta: T
     return weight / weight.amax(-1, keepdim=True) + 0.05
 
 
-class _Path(NamedTuple):
+class Along(NamedTuple):
     """States and controls of an iterate, at the nodes and at the interval centres."""
 
     x: Tensor
@@ -143,16 +143,17 @@ class _Path(NamedTuple):
     middle: tuple[Tensor, Tensor]
 
 
-def _path(game: Game, at: Iterate) -> _Path:
+def along_mesh(game: Game, at: Iterate) -> Along:
+    """States and optimal controls of an iterate."""
     equations = Collocation(game)
     centre = equations.midpoint(at.z, equations.rate(at.z, at.theta), at.t.diff(dim=-1))
     (x, own), (middle_x, middle_own) = equations.split(at.z), equations.split(centre)
-    return _Path(x, game.best_response(x, own), (middle_x, game.best_response(middle_x, middle_own)))
+    return Along(x, game.best_response(x, own), (middle_x, game.best_response(middle_x, middle_own)))
 
 
 def _total(game: Game, at: Iterate) -> Tensor:
     """Sum of the players' values from the start, (B,)."""
-    return values(game, at.t, *_path(game, at), at.theta)[:, 0].sum(-1)
+    return values(game, at.t, *along_mesh(game, at), at.theta)[:, 0].sum(-1)
 
 
 def _places(tried: Tensor, status: Tensor) -> tuple[Tensor, Tensor]:
@@ -182,7 +183,7 @@ def _best(total: Tensor, found: Solved, tried: Tensor) -> tuple[Tensor, Tensor]:
 def _describe(game: Game, found: OnMesh, settings: Solver) -> Extremal:
     """Extremals on the label grid, with their certificates."""
     at, residual, status, totals = found
-    path = x, u, middle = _path(game, at)
+    path = x, u, middle = along_mesh(game, at)
     costate = costates(game, at.t, *path, at.theta)
     value = values(game, at.t, *path, at.theta)
     everywhere = torch.cat([x, middle[0]], 1)

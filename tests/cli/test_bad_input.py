@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -8,9 +7,8 @@ import pytest
 import torch
 
 from hno.data import datamodule
-from hno.data.labels import label_path
+from hno.data.labels import label_set
 from hno.games import make
-from hno.pontryagin import Solver
 from hno.types import Extremal
 from tests.cli.conftest import SMOKE, Command, refused
 from tests.conftest import TEST, TRAIN
@@ -130,20 +128,19 @@ def test_unwritable_label_folder(command: Command) -> None:
 
 
 @pytest.fixture
-def own_cache(labels: Callable[..., Extremal], cache: Path, tmp_path: Path) -> Path:
+def own_cache(labels: Callable[..., Extremal], tmp_path: Path) -> Path:
     """A copy of the labels that a smoke run needs."""
-    folder = tmp_path / "labels" / "NarrowRoad"
-    folder.mkdir(parents=True)
     for request in (TRAIN, TEST):
-        labels("narrow_road", request)
-        shutil.copy(label_path(make("narrow_road"), request, cache, Solver()), folder)
-    return folder.parent
+        own = label_set(make("narrow_road"), request, tmp_path / "labels")
+        own.append(0, 0, labels("narrow_road", request))
+        own.write_manifest()
+    return tmp_path / "labels"
 
 
 @pytest.mark.parametrize("split", ["train", "test"])
 @pytest.mark.parametrize("damage", ["truncated", "flipped"])
 def test_damaged_label_file(command: Command, own_cache: Path, split: str, damage: str) -> None:
-    (path,) = own_cache.rglob(f"1-1_{split}*_n4_*.safetensors")
+    (path,) = own_cache.rglob(f"1-1_{split}*/shard-*.safetensors")
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 1
     path.write_bytes(content[:-100] if damage == "truncated" else content)
@@ -155,7 +152,7 @@ def test_damaged_label_file(command: Command, own_cache: Path, split: str, damag
 
 
 def test_a_label_file_that_was_moved_away_is_solved_again(command: Command, own_cache: Path) -> None:
-    (path,) = own_cache.rglob("1-1_test*_n4_*.safetensors")
+    (path,) = own_cache.rglob("1-1_test*/shard-*.safetensors")
     before = path.read_bytes()
     path.unlink()
     assert command("train", *SMOKE, "trainer.max_steps=1", f"data.cache={own_cache}").code == 0

@@ -9,7 +9,7 @@ from omegaconf import OmegaConf
 
 import hno
 from hno.cli.config import config_dir
-from hno.cli.evaluate import parse_types
+from hno.cli.evaluate import types_to_evaluate
 from hno.games.base import ExtrapolationWarning
 from tests.cli.conftest import SMOKE, Command, refused
 
@@ -41,34 +41,34 @@ def test_types_from_the_command_line(command: Command, random_checkpoint: Path) 
 @pytest.mark.parametrize(("name", "size"), [("grid5", 5), ("grid9", 9)])
 def test_named_grids_span_the_types_of_the_game(random_checkpoint: Path, name: str, size: int) -> None:
     policy = hno.load_policy(random_checkpoint)
-    types = parse_types(name, policy)
+    types = types_to_evaluate(name, policy)
     axis = torch.linspace(1, 5, size).tolist()
     assert types == [pytest.approx(theta) for theta in itertools.product(axis, axis)]
 
 
 def test_default_types_are_the_seen_ones_and_four_unseen(random_checkpoint: Path) -> None:
     unseen = OmegaConf.load(config_dir() / "evaluate.yaml").unseen
-    types = parse_types("default", hno.load_policy(random_checkpoint), unseen)
+    types = types_to_evaluate("default", hno.load_policy(random_checkpoint), unseen)
     assert types == [(1.0, 1.0), (1.0, 2.0), (2.0, 2.0), (2.0, 4.0), (4.0, 5.0)]
 
 
 def test_types_outside_the_range_warn(random_checkpoint: Path) -> None:
     with pytest.warns(ExtrapolationWarning, match="extrapolate"):
-        assert parse_types("6,1", hno.load_policy(random_checkpoint)) == [(6.0, 1.0)]
+        assert types_to_evaluate("6,1", hno.load_policy(random_checkpoint)) == [(6.0, 1.0)]
 
 
 @pytest.mark.usefixtures("no_labels")
 @pytest.mark.parametrize(
     ("theta", "message"),
     [
-        ("everything", "default, grid5, grid9"),
-        ("grid7", "default, grid5, grid9"),
+        ("everything", "grid5, grid9"),
+        ("grid7", "grid5, grid9"),
         ("1,1;2", "2 finite numbers"),
         ("1", "2 finite numbers"),
         ("1,1,1", "2 finite numbers"),
         ("1,nan", "2 finite numbers"),
         ("1,inf", "2 finite numbers"),
-        ("1,1;", "default, grid5, grid9"),
+        ("1,1;", "grid5, grid9"),
     ],
 )
 def test_impossible_types(command: Command, random_checkpoint: Path, theta: str, message: str) -> None:

@@ -1,20 +1,39 @@
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+from torch import Tensor
 
 from hno.data import GameData
+from hno.data import labels as label_data
 from hno.data.curriculum import Curriculum
 from hno.games import Game, make
-from tests.fakes import fake_labels
+from hno.pontryagin.solve import Solver
+from hno.types import Extremal
+from tests.fakes import fake_labels, fake_solve
 
 TYPES = ((1.0, 1.0), (5.0, 5.0), (1.0, 5.0), (2.0, 3.0))
 MIXED = {"box": 0.4, "band": 0.3, "labels": 0.3}
 
 MakeData = Callable[..., GameData]
+Asked = Counter[tuple[float, ...]]
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> Asked:
+    """A solver that answers at once, and how many rows of each type were asked of it."""
+    count: Asked = Counter()
+
+    def answer(game: Game, x0: Tensor, theta: Tensor, settings: Solver) -> Extremal:
+        count[tuple(theta[0].tolist())] += len(x0)
+        return fake_solve(game, x0, theta)
+
+    monkeypatch.setattr(label_data, "solve", answer)
+    return count
 
 
 @pytest.fixture

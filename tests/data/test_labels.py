@@ -7,16 +7,22 @@ import pytest
 import torch
 from torch import Tensor
 
-from hno.data import generate
-from hno.data.labels import Request, default_cache, label_path, labels_for, start_states
+from hno.data import labels as label_data
+from hno.data import shards
+from hno.data.labels import Progress, Request, default_cache, label_set, labels_for, start_states
 from hno.data.store import LabelFileError
 from hno.games import Game, make
 from hno.pontryagin.solve import Solver
 from hno.types import Extremal, Status
 from tests.conftest import TRAIN
-from tests.fakes import fake_labels
+from tests.data.conftest import Asked
+from tests.fakes import fake_labels, fake_solve
 
 REQUEST = Request((1.0, 5.0), 6, 0, "train")
+
+
+def bits(labels: Extremal) -> list[bytes]:
+    return [tensor.numpy().tobytes() for tensor in labels]
 
 
 @pytest.mark.parametrize("name", ["narrow_road", "lane_change", "drone"])
@@ -56,25 +62,34 @@ def test_widened_start_box() -> None:
 
 
 def test_key_is_the_same_for_the_same_content(tmp_path: Path) -> None:
-    first = label_path(make("narrow_road"), REQUEST, tmp_path, Solver())
-    assert label_path(make("narrow_road"), REQUEST, tmp_path, Solver()) == first
-    assert label_path(make("narrow_road", radius=1.25), REQUEST, tmp_path, Solver()) == first
+    first = label_set(make("narrow_road"), REQUEST, tmp_path)
+    assert label_set(make("narrow_road"), REQUEST, tmp_path, Solver()) == first
+    assert label_set(make("narrow_road", radius=1.25), REQUEST, tmp_path) == first
+    whole, real = (label_set(make("narrow_road", radius=radius), REQUEST, tmp_path) for radius in (1, 1.0))
+    assert whole == real
+
+
+def test_key_is_the_same_for_any_number_of_starts(tmp_path: Path) -> None:
+    few, many = (label_set(make("narrow_road"), REQUEST._replace(starts=n), tmp_path) for n in (1, 1000))
+    assert few == many
+    assert few.provenance == many.provenance
 
 
 @pytest.mark.parametrize(
     "change",
     [
         {"game": make("narrow_road", radius=1.3)},
+        {"game": make("narrow_road", radius=1.2500001)},
         {"game": make("narrow_road", speed=17.0)},
         {"game": make("narrow_road", horizon=2.0)},
         {"game": make("lane_change")},
         {"request": REQUEST._replace(theta=(5.0, 1.0))},
         {"request": REQUEST._replace(theta=(1.0000001, 5.0))},
-        {"request": REQUEST._replace(starts=7)},
         {"request": REQUEST._replace(seed=1)},
         {"request": REQUEST._replace(split="test")},
         {"request": REQUEST._replace(widen=2.0)},
         {"settings": Solver(extra_nodes=61)},
+        {"settings": Solver(reintegration=1e-5)},
         {"settings": Solver(newton=Solver().newton._replace(tolerance=1e-7))},
         {"settings": Solver(search=Solver().search._replace(margin=0.5))},
     ],
@@ -82,13 +97,13 @@ def test_key_is_the_same_for_the_same_content(tmp_path: Path) -> None:
 )
 def test_key_changes_with_whatever_determines_labels(tmp_path: Path, change: dict[str, object]) -> None:
     same = {"game": make("narrow_road"), "request": REQUEST, "cache": tmp_path, "settings": Solver()}
-    assert label_path(**(same | change)) != label_path(**same)
+    assert label_set(**(same | change)) != label_set(**same)
 
 
 def test_key_changes_with_the_version_of_the_solver(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    before = label_path(make("narrow_road"), REQUEST, tmp_path, Solver())
-    monkeypatch.setattr(generate, "SOLVER_VERSION", generate.SOLVER_VERSION + 1)
-    assert label_path(make("narrow_road"), REQUEST, tmp_path, Solver()) != before
+    before = label_set(make("narrow_road"), REQUEST, tmp_path)
+    monkeypatch.setattr(label_data, "SOLVER_VERSION", label_data.SOLVER_VERSION + 1)
+    assert label_set(make("narrow_road"), REQUEST, tmp_path) != before
 
 
 def test_cache_folder_comes_from_the_environment(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -113,7 +128,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[tuple[float, ...]]:
             raise RuntimeError("power cut")
         return fake_labels(game, theta[0].tolist(), len(x0), start=x0)
 
-    monkeypatch.setattr(generate, "solve", answer)
+    monkeypatch.setattr(label_data, "solve", answer)
     return asked
 
 
@@ -130,17 +145,40 @@ def test_an_interrupted_generation_keeps_what_is_complete(tmp_path: Path, calls:
     game, requests = make("narrow_road"), [REQUEST, REQUEST._replace(theta=(9.0, 9.0))]
     with pytest.raises(RuntimeError, match="power cut"):
         labels_for(game, requests, tmp_path, workers=1)
-    assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == [
-        label_path(game, REQUEST, tmp_path, Solver()).name
-    ]
+    assert list(tmp_path.rglob("shard-*")) == [label_set(game, REQUEST, tmp_path).path(0)]
+    assert len(label_set(game, REQUEST, tmp_path).read(6).status) == 6
 
 
-def test_chunks_are_joined_in_the_order_of_the_starts(tmp_path: Path, calls: list[tuple[float, ...]]) -> None:
-    game, counted = make("narrow_road"), []
-    settings = Solver(chunk=4)
-    found, _ = labels_for(game, [REQUEST], tmp_path, settings, 1, lambda done, total: counted.append((done, total)))
-    assert torch.equal(found[0].x[:, 0], start_states(game, REQUEST))
-    assert counted == [(4, 6), (6, 6)]
+def test_shards_are_joined_in_the_order_of_the_starts(tmp_path: Path, asked: Asked) -> None:
+    game, request = make("narrow_road"), REQUEST._replace(starts=300)
+    (found,), _ = labels_for(game, [request], tmp_path, workers=1)
+    assert torch.equal(found.x[:, 0], start_states(game, request))
+
+
+def test_progress_counts_the_rows_that_are_solved(tmp_path: Path, asked: Asked) -> None:
+    game, told = make("narrow_road"), list[Progress]()
+    for starts in (100, 300, 300):
+        labels_for(game, [REQUEST._replace(starts=starts)], tmp_path, workers=1, report=told.append)
+    assert told == [(100, 100, 100), (28, 200, 28), (156, 200, 156), (200, 200, 200)]
+
+
+def test_progress_tells_converged_rows_from_failed_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def every_other(game: Game, x0: Tensor, theta: Tensor, settings: Solver) -> Extremal:
+        return fake_solve(game, x0, theta)._replace(status=torch.arange(len(x0)) % 2)
+
+    monkeypatch.setattr(label_data, "solve", every_other)
+    told: list[Progress] = []
+    (found,), _ = labels_for(make("narrow_road"), [REQUEST], tmp_path, workers=1, report=told.append)
+    assert told == [(6, 6, 3)]
+    assert found.status.tolist() == [0, 1, 0, 1, 0, 1]
+
+
+def test_requests_of_one_set_share_its_rows(tmp_path: Path, asked: Asked) -> None:
+    requests = [REQUEST._replace(starts=starts) for starts in (100, 300, 100)]
+    found, _ = labels_for(make("narrow_road"), requests, tmp_path, workers=1)
+    assert [len(labels.status) for labels in found] == [100, 300, 100]
+    assert sum(asked.values()) == 300
+    assert torch.equal(found[0].value, found[1].value[:100])
 
 
 def test_unwritable_folder_is_refused_before_solving(calls: list[tuple[float, ...]]) -> None:
@@ -152,7 +190,7 @@ def test_unwritable_folder_is_refused_before_solving(calls: list[tuple[float, ..
 def test_damaged_file_is_named_and_kept_before_solving(tmp_path: Path, calls: list[tuple[float, ...]]) -> None:
     game = make("narrow_road")
     labels_for(game, [REQUEST], tmp_path, workers=1)
-    path = label_path(game, REQUEST, tmp_path, Solver())
+    path = label_set(game, REQUEST, tmp_path).path(0)
     path.write_bytes(path.read_bytes()[:-5])
     calls.clear()
     with pytest.raises(LabelFileError, match=path.name):
@@ -160,11 +198,19 @@ def test_damaged_file_is_named_and_kept_before_solving(tmp_path: Path, calls: li
     assert not calls
 
 
-def test_serial_and_parallel_labels_are_equal_bit_for_bit(tmp_path: Path) -> None:
-    game, settings = make("narrow_road"), Solver(chunk=2)
-    serial, parallel = (labels_for(game, [TRAIN], tmp_path / str(n), settings, n)[0][0] for n in (1, 2))
-    assert bool((serial.status == Status.CONVERGED).all())
-    assert all(one.numpy().tobytes() == two.numpy().tobytes() for one, two in zip(serial, parallel, strict=True))
+def test_labels_are_equal_bit_for_bit_however_they_are_split(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, labels: Callable[..., Extremal]
+) -> None:
+    """Solved at once, shard by shard in one process or in two, and as an extension of a smaller set."""
+    game, once = make("narrow_road"), bits(labels("narrow_road"))
+    assert bool((labels("narrow_road").status == Status.CONVERGED).all())
+    for module in (label_data, shards):
+        monkeypatch.setattr(module, "SHARD", 2)
+    for workers in (1, 2):
+        assert bits(labels_for(game, [TRAIN], tmp_path / str(workers), workers=workers)[0][0]) == once
+    for starts in (1, 3, 4):
+        (found,), _ = labels_for(game, [TRAIN._replace(starts=starts)], tmp_path / "grown", workers=1)
+    assert bits(found) == once
 
 
 def test_labels_start_where_they_were_asked(labels: Callable[..., Extremal]) -> None:

@@ -119,7 +119,7 @@ def test_other_format_is_refused(written: Path, labels: Extremal, monkeypatch: p
     with monkeypatch.context() as patch:
         patch.setattr(store, "FORMAT", 99)
         write_labels(written, labels, PROVENANCE)
-    assert "format 99, expected 1" in refused(written)
+    assert f"format 99, expected {store.FORMAT}" in refused(written)
 
 
 def half_a_file(tensors: object, path: str, metadata: object = None) -> None:

@@ -1,0 +1,33 @@
+"""Label generation as a process that tests kill: a solver that answers at once, in shards of four rows."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from hno.data import labels, shards
+from hno.games import Game, make
+from hno.pontryagin.solve import Solver
+from tests.fakes import fake_solve
+
+SHARD = 4
+THETAS = ((1.0, 1.0), (2.0, 3.0), (5.0, 5.0))
+
+
+def write(cache: Path, starts: int, workers: int = 1) -> None:
+    """Generate sets of three types, as the leader of a process group of its own."""
+    os.setpgid(0, 0)
+    torch.set_num_threads(1)
+    labels.solve, labels._solve_alone = fake_solve, _solve_alone
+    labels.SHARD = shards.SHARD = SHARD
+    requests = [labels.Request(theta, starts, 0, "train") for theta in THETAS]
+    labels.generate(make("narrow_road"), requests, cache, workers=workers)
+
+
+def _solve_alone(game: Game, job: labels._Job, settings: Solver) -> Tensor:
+    """What worker processes run; they import the package anew."""
+    labels.solve = fake_solve
+    return labels._solve_shard(game, job, settings)
