@@ -155,8 +155,9 @@ def _total(rows: Sequence[dict[str, Any]]) -> str:
     )
     least = min(row["status"]["converged"] / row["starts"] for row in rows)
     return (
-        f"{converged:,} of {starts:,} converged ({converged / starts:.2%}, at least {least:.1%} at a type); best-response "
-        f"gap above {LOCAL_GAP:g} from the equilibrium itself: {local}, above {GLOBAL_GAP:g} from several starts: {wide}."
+        f"{converged:,} of {starts:,} converged ({converged / starts:.2%}, at least {least:.1%} at a type). "
+        f"Best-response gap above {LOCAL_GAP:g} from the equilibrium itself: {local}; "
+        f"above {GLOBAL_GAP:g} from several starts: {wide}."
     )
 
 

@@ -86,9 +86,9 @@ def _attempt(game: Game, x0: Tensor, theta: Tensor, t: Tensor, shape: Tensor, to
     found = solve_bvp(rate, boundary, t.numpy(), guess, tol=tolerance, max_nodes=5000)
     x, costate = split(found.sol(t.numpy()))
     fine = np.linspace(0, game.horizon, 4001)
-    samples, states = torch.from_numpy(fine), found.sol(fine)
-    value = _value(game, samples, *split(states), theta)
-    joint = torch.from_numpy(np.ascontiguousarray(states.T))[::4]
+    samples, sampled = torch.from_numpy(fine), found.sol(fine)
+    value = _value(game, samples, *split(sampled), theta)
+    joint = torch.from_numpy(np.ascontiguousarray(sampled.T))[::4]
     path = Iterate(samples[None, ::4], joint.unsqueeze(0), theta.unsqueeze(0))
     return Reference(found.success, value if found.success else torch.full_like(value, torch.nan), x, costate, path)
 
