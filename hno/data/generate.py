@@ -6,6 +6,7 @@ import os
 import sys
 import time
 from collections.abc import Iterator, Sequence
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
+from yaml import YAMLError  # type: ignore[import-untyped]
 
 from hno.data import labels as label_data
 from hno.data.labels import Report, Request, default_cache, label_set, labels_for
@@ -65,6 +67,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         text = error.args[0] if isinstance(error, KeyError) and error.args else error
         print(f"{type(error).__name__}: {text}", file=sys.stderr)
         return 1
+    except BrokenProcessPool:
+        text = "A worker process was killed, mostly for lack of memory. Finished shards are kept: try fewer workers."
+        print(text, file=sys.stderr)
+        return 1
     except KeyboardInterrupt:
         print("Stopped. Finished shards are kept: the same command goes on from here.", file=sys.stderr)
         return 130
@@ -78,7 +84,10 @@ def read_options(given: Sequence[str]) -> DictConfig:
         ValueError: an unknown or missing option, or a value that makes no sense.
     """
     wrong = [word for word in given if "=" not in word]
-    options = OmegaConf.from_cli([word for word in given if "=" in word])
+    try:
+        options = OmegaConf.from_cli([word for word in given if "=" in word])
+    except YAMLError as error:
+        raise ValueError(f"The options {' '.join(given)} cannot be read: {error}") from error
     wrong += [str(name) for name in options if name not in DEFAULTS]
     merged = OmegaConf.merge(DEFAULTS, options)
     assert isinstance(merged, DictConfig)
@@ -102,7 +111,7 @@ def read_options(given: Sequence[str]) -> DictConfig:
 def run(options: DictConfig) -> None:
     """Generate, and print a table and where the sets are."""
     game = make(str(options.game), **{str(name): value for name, value in options.constants.items()})
-    cache = default_cache() if options.cache is None else Path(options.cache)
+    cache = default_cache() if options.cache is None else Path(str(options.cache))
     requests = [
         Request(theta, options.n, options.seed, options.split, float(options.widen))
         for theta in parse_types(game, str(options.theta))
@@ -146,13 +155,8 @@ def progress_report(console: Console, every: float = 10.0) -> Iterator[Report]:
 
 def _total(rows: Sequence[dict[str, Any]]) -> str:
     """One sentence over all types."""
-    starts, converged, local, wide = (
-        sum(counts)
-        for counts in zip(
-            *((r["starts"], r["status"]["converged"], r["above_local_gap"], r["above_global_gap"]) for r in rows),
-            strict=True,
-        )
-    )
+    starts, local, wide = (sum(row[name] for row in rows) for name in ("starts", "above_local_gap", "above_global_gap"))
+    converged = sum(row["status"]["converged"] for row in rows)
     least = min(row["status"]["converged"] / row["starts"] for row in rows)
     return (
         f"{converged:,} of {starts:,} converged ({converged / starts:.2%}, at least {least:.1%} at a type). "

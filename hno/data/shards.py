@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -86,7 +87,8 @@ class LabelSet:
 
     def write_manifest(self) -> None:
         """Write down which shards there are, with their checksums and how far their labels can be trusted."""
-        if self._listed() == self._shards() and not self._drafts():
+        current = self._listed() == self._shards() and not self._drafts()
+        if current or not os.access(self.folder, os.W_OK):  # a read-only cache can still be read
             return
         with self._lock():
             for draft in self._drafts():  # left by a killed process: who writes holds the lock

@@ -107,9 +107,16 @@ def row_count(path: Path) -> int:
 
 
 def checksum(path: Path) -> str:
-    """The checksum of its content that a label file carries."""
-    with safetensors.safe_open(path, framework="pt") as file:
-        return str(json.loads((file.metadata() or {})[KEY])["sha256"])
+    """The checksum of its content that a label file carries.
+
+    Raises:
+        LabelFileError: not a label file.
+    """
+    try:
+        with safetensors.safe_open(path, framework="pt") as file:
+            return str(json.loads((file.metadata() or {})[KEY])["sha256"])
+    except (safetensors.SafetensorError, OSError, KeyError, ValueError, TypeError) as error:
+        raise LabelFileError(f"{path} carries no checksum of hno's ({error!r}). {_ADVICE}") from error
 
 
 _ADVICE = "Move it away and run again; the labels are then solved anew."

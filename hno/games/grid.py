@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 
 from hno.games.base import Game
 
@@ -10,8 +11,13 @@ GRIDS = {"grid5": 5, "grid9": 9}
 """Named grids over the type box: points per player."""
 
 
-def parse_types(game: Game, text: str) -> list[tuple[float, ...]]:
+def parse_types(game: Game, text: str, also: Sequence[str] = ()) -> list[tuple[float, ...]]:
     """Player types from a named grid, or from a list such as "1,1;2.5,4".
+
+    Args:
+        game: the game.
+        text: the name or the list.
+        also: further names that the caller knows, for the message.
 
     Raises:
         ValueError: neither, or entries that are not one finite number per player.
@@ -24,6 +30,6 @@ def parse_types(game: Game, text: str) -> list[tuple[float, ...]]:
     try:
         types = [[float(entry) for entry in part.split(",")] for part in str(text).split(";")]
     except ValueError as error:
-        known = ", ".join(GRIDS)
+        known = ", ".join((*also, *GRIDS))
         raise ValueError(f"theta must be one of {known}, or a list such as '1,1;2.5,4'; got {text!r}.") from error
     return game.validate_types(types)

@@ -105,11 +105,12 @@ def global_gap(
     own = alone.scaled(u)[rows][:, label_places(t.float().unsqueeze(0), times[:-1])[0]].clamp(-1, 1)
     shapes = manoeuvres(game, 1, dtype=theta.dtype, device=theta.device)[:, nodes] * alone.acts[:, None, None, :, None]
     rest = torch.where(alone.acts[:, None, :, None] > 0, at_rest(alone, start).unsqueeze(1), own)
-    many = torch.arange(len(rows), device=theta.device).repeat_interleave(shapes.shape[1])
+    number = torch.arange(len(rows), device=theta.device)
+    many = number.repeat_interleave(shapes.shape[1])
     tried, cost = best_amplitude(alone.rows(many), start[many], rest[many], shapes.flatten(0, 1), search.amplitudes)
     best = cost.view(len(rows), -1).topk(kept, largest=False).indices
-    tried = torch.cat([own.unsqueeze(1), tried.view(*shapes.shape)[torch.arange(len(rows)).unsqueeze(-1), best]], 1)
-    many = torch.arange(len(rows), device=theta.device).repeat_interleave(1 + kept)
+    tried = torch.cat([own.unsqueeze(1), tried.view(*shapes.shape)[number.unsqueeze(-1), best]], 1)
+    many = number.repeat_interleave(1 + kept)
     reached = descend(alone.rows(many), start[many], tried.flatten(0, 1), iterations, search.tolerance)[2]
     before, *others = reached.view(len(rows), -1).unbind(-1)
     return _relative(before - torch.stack(others).amin(0), before, theta)

@@ -61,7 +61,7 @@ def test_types_outside_the_range_warn(random_checkpoint: Path) -> None:
 @pytest.mark.parametrize(
     ("theta", "message"),
     [
-        ("everything", "grid5, grid9"),
+        ("everything", "default, grid5, grid9"),
         ("grid7", "grid5, grid9"),
         ("1,1;2", "2 finite numbers"),
         ("1", "2 finite numbers"),

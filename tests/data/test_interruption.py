@@ -1,11 +1,14 @@
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
 import os
 import random
 import signal
+import subprocess
+import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
@@ -24,8 +27,8 @@ def start() -> Start:
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["tests.data.writer"])
 
-    def started(cache: Path, starts: int = STARTS, workers: int = 1) -> BaseProcess:
-        process = context.Process(target=write, args=(cache, starts, workers))
+    def started(cache: Path, starts: int = STARTS) -> BaseProcess:
+        process = context.Process(target=write, args=(cache, starts))
         process.start()
         return process
 
@@ -48,13 +51,13 @@ def written(cache: Path) -> dict[Path, int]:
 
 
 def kill(process: BaseProcess, cache: Path, delay: float) -> bool:
-    """Kill a process and its workers some time after it has written a shard; False if it was done before."""
+    """Kill a process some time after it has written a shard; False if it was done before."""
     before = written(cache)
     while process.is_alive() and written(cache) == before:
         time.sleep(0.001)
     process.join(delay)
     if process.is_alive():
-        os.killpg(process.pid, signal.SIGKILL)
+        process.kill()
     process.join(120)
     return process.exitcode == -signal.SIGKILL
 
@@ -67,18 +70,6 @@ def whole(start: Start, tmp_path_factory: pytest.TempPathFactory) -> dict[str, b
     return tree(cache)
 
 
-def killed_and_finished(start: Start, cache: Path, growing: Sequence[int], workers: int = 1) -> int:
-    """Kill runs that ask for more and more starts, then let one finish.
-
-    Returns:
-        How many were killed before they were done.
-    """
-    chance = random.Random(0)
-    kills = [kill(start(cache, starts, workers), cache, chance.uniform(0, 0.03)) for starts in growing]
-    assert finished(start(cache, STARTS, workers))
-    return sum(kills)
-
-
 def test_uninterrupted_run_leaves_shards_and_manifests_only(whole: dict[str, bytes]) -> None:
     names = [f"shard-{shard:05}.safetensors" for shard in range(STARTS // SHARD)] + ["manifest.json"]
     assert sorted(Path(path).name for path in whole) == sorted(names * len(THETAS))
@@ -87,15 +78,34 @@ def test_uninterrupted_run_leaves_shards_and_manifests_only(whole: dict[str, byt
 def test_killed_runs_that_are_run_again_leave_what_one_run_would(
     start: Start, whole: dict[str, bytes], tmp_path: Path
 ) -> None:
-    assert killed_and_finished(start, tmp_path, range(14, STARTS, 4)) >= 8
+    """Every run asks for more starts than the one before."""
+    chance = random.Random(0)
+    kills = [kill(start(tmp_path, starts), tmp_path, chance.uniform(0, 0.03)) for starts in range(14, STARTS, 4)]
+    assert sum(kills) >= 8
+    assert finished(start(tmp_path))
     assert tree(tmp_path) == whole
 
 
+def launch(cache: Path, starts: int) -> subprocess.Popen[bytes]:
+    """A writer with two worker processes, all in one process group."""
+    text = f"from pathlib import Path; from tests.data.writer import write; write(Path({str(cache)!r}), {starts}, 2)"
+    root = Path(__file__).parents[2]
+    return subprocess.Popen([sys.executable, "-c", text], cwd=root, process_group=0, stderr=subprocess.DEVNULL)
+
+
 @pytest.mark.slow
-def test_killed_runs_with_workers_leave_what_one_run_would(
-    start: Start, whole: dict[str, bytes], tmp_path: Path
-) -> None:
-    assert killed_and_finished(start, tmp_path, range(14, STARTS, 10), workers=2) >= 3
+def test_killed_runs_with_workers_leave_what_one_run_would(whole: dict[str, bytes], tmp_path: Path) -> None:
+    chance, kills = random.Random(0), 0
+    for starts in (14, 34, 54):
+        run, before = launch(tmp_path, starts), written(tmp_path)
+        while run.poll() is None and written(tmp_path) == before:
+            time.sleep(0.001)
+        time.sleep(chance.uniform(0, 0.02))
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(run.pid, signal.SIGKILL)
+        kills += run.wait() == -signal.SIGKILL
+    assert kills >= 2
+    assert launch(tmp_path, STARTS).wait() == 0
     assert tree(tmp_path) == whole
 
 

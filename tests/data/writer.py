@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import torch
@@ -18,8 +17,7 @@ THETAS = ((1.0, 1.0), (2.0, 3.0), (5.0, 5.0))
 
 
 def write(cache: Path, starts: int, workers: int = 1) -> None:
-    """Generate sets of three types, as the leader of a process group of its own."""
-    os.setpgid(0, 0)
+    """Generate sets of three types."""
     torch.set_num_threads(1)
     labels.solve, labels._solve_alone = fake_solve, _solve_alone
     labels.SHARD = shards.SHARD = SHARD

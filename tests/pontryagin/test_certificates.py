@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 from torch import Tensor
+from torch.autograd.functional import hessian, jacobian
 
 from hno.games import Box, ControlAffineGame, Game, make
 from hno.pontryagin import Solver, solve
@@ -12,7 +13,7 @@ from hno.pontryagin.certificates import global_gap, local_gap, reintegration_err
 from hno.pontryagin.collocation import Collocation, Iterate, Newton, newton
 from hno.pontryagin.mesh import label_times
 from hno.pontryagin.solve import solve_on_mesh
-from hno.types import Extremal, Status
+from hno.types import Status
 from tests.lq import LinearQuadratic, open_loop_nash, quadratic, random_game
 from tests.pontryagin.encounters import NAMES, starts, types
 
@@ -38,7 +39,7 @@ def shifted(at: Iterate, distance: float) -> Iterate:
     return at._replace(z=z)
 
 
-def weakened(game: Game, at: Iterate, player: int, factor: float = 0.5) -> Iterate:
+def weakened(game: Game, at: Iterate, player: int, factor: float = 0.0) -> Iterate:
     """The own costates of one player, and with them its efforts, times a factor."""
     x, own = Collocation(game).split(at.z)
     scale = torch.ones(game.players, 1, dtype=own.dtype)
@@ -93,20 +94,17 @@ def test_the_gap_of_a_solution_falls_with_the_fourth_power_of_the_mesh_width():
 
 @pytest.mark.parametrize("player", [0, 1])
 @pytest.mark.parametrize("name", NAMES)
-def test_a_player_who_does_half_of_what_is_best_gains_much(name, player):
+def test_a_player_who_does_nothing_gains_much_by_acting(name, player):
     game = make(name).double()
-    gap = local_gap(game, weakened(game, solved(game), player))
-    assert gap[:, player].min() > 1e-3
+    gap = local_gap(game, weakened(game, solved(game, 2), player))
+    assert gap[:, player].min() > 1e-2
 
 
 @pytest.mark.parametrize("player", [0, 1])
-def test_only_the_player_who_deviates_has_a_gap_where_the_other_does_not_meet_it(player):
-    """Drones far from each other."""
+def test_only_the_player_who_deviates_has_a_gap_where_nothing_couples_the_players(player):
     game = make("drone").double()
-    x0, theta = starts(game, 2), types(2, 1, 1)
     game.penalty_height = 1e-9
-    at = solve_on_mesh(game, x0, theta).at
-    gap = local_gap(game, weakened(game, at, player, 0.0))
+    gap = local_gap(game, weakened(game, solved(game, 2), player))
     assert gap[:, player].min() > 1e-2
     assert gap[:, 1 - player].max() < 1e-6
 
@@ -133,8 +131,8 @@ def exact_gain(game: LinearQuadratic, x0: Tensor, u: Tensor, player: int) -> Ten
     for row in range(len(x0)):
         own = u[row, :, player]
         paid = cost(own, row)
-        slope = torch.func.grad(cost)(own, row).flatten()
-        curve = torch.func.hessian(cost)(own, row).view(len(slope), -1)
+        slope = jacobian(lambda at, row=row: cost(at, row), own).flatten()
+        curve = hessian(lambda at, row=row: cost(at, row), own).view(len(slope), -1)
         gains.append(slope @ torch.linalg.solve(curve, slope) / 2 / paid.abs().clamp_min(1))
     return torch.stack(gains)
 
@@ -149,8 +147,9 @@ def test_the_local_gap_of_a_linear_quadratic_game_is_the_exact_gain():
     x, own = Collocation(game).split(at.z)
     found = local_gap(game, at._replace(z=torch.cat([x.flatten(-2), (weak.unsqueeze(-1) * own).flatten(-2)], -1)))
     exact = torch.stack([exact_gain(game, x0, u, player) for player in (0, 1)], -1)
-    assert exact.min() > 1e-4
-    torch.testing.assert_close(found, exact, rtol=1e-2, atol=1e-5)
+    assert exact.amin(0).min() > 1e-5
+    assert exact.amax(0).min() > 1e-2
+    torch.testing.assert_close(found, exact, rtol=1e-2, atol=1e-6)
 
 
 class Pillar(ControlAffineGame):
@@ -228,7 +227,6 @@ def test_every_extremal_carries_its_certificates(name):
         assert certificate.isfinite().all()
         assert (certificate >= 0).all()
     assert found.reintegration.max() <= Solver().reintegration
-    assert set(Extremal._fields) >= {"reintegration", "local_gap", "global_gap"}
 
 
 def test_a_row_whose_controls_lead_elsewhere_is_inaccurate():
