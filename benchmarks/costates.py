@@ -17,7 +17,8 @@ import torch
 from torch import Tensor
 
 from hno.games import Game, make
-from hno.pontryagin.collocation import Collocation, Iterate, Newton, newton
+from hno.pontryagin.collocation import Collocation, Iterate
+from hno.pontryagin.newton import Newton, newton
 from hno.pontryagin.solve import along_mesh, solve_on_mesh
 from hno.pontryagin.sweep import costates, values
 from hno.types import Status

@@ -1,12 +1,11 @@
-"""Batched Newton on Hermite-Simpson (Lobatto IIIA) collocation of Pontryagin's conditions.
+"""Hermite-Simpson (Lobatto IIIA) collocation of Pontryagin's conditions.
 
 Unknowns are the states and own costates, D = 2 P n per node. Trajectories are independent rows of a batch: each has its
-own mesh, step length and stopping test.
+own mesh.
 """
 
 from __future__ import annotations
 
-import copy
 from typing import NamedTuple
 
 import torch
@@ -15,25 +14,10 @@ from torch import Tensor
 from hno.games import Game
 from hno.games.base import own_costate
 from hno.pontryagin.adjoint import jacobian_rows, pmp_rate, pmp_rate_and_jacobian, terminal_costate
-from hno.types import Status
+from hno.pontryagin.elimination import Elimination, eliminate
 
 BLOCK = 1024
 """Points that are differentiated together: few enough for the processor's cache."""
-
-
-class Newton(NamedTuple):
-    """When Newton stops."""
-
-    tolerance: float = 1e-10
-    """Largest scaled residual of a converged trajectory."""
-    steps: int = 40
-    """Step budget."""
-    reuses: int = 6
-    """Further steps with the derivatives of one step, while they cut the residual to a fifth."""
-    halvings: int = 8
-    """Step-length halvings before the search counts as stalled."""
-    full_steps: int = 20
-    """Budget of undamped steps for a stalled trajectory, from each of two origins."""
 
 
 class Iterate(NamedTuple):
@@ -164,184 +148,3 @@ def hermite(ends: Ends, step: Tensor, share: Tensor) -> Tensor:
     """The cubic with given values and rates at both ends of a step, at a share of it."""
     chord = ends.before + (3 - 2 * share) * share**2 * (ends.after - ends.before)
     return chord + step * share * (1 - share) * ((1 - share) * ends.rate_before - share * ends.rate_after)
-
-
-class Elimination(NamedTuple):
-    """Block elimination of left_k dz_k + right_k dz_{k+1} = -defect_k with dl_K = slope dx_K - terminal defect.
-
-    Backward, the step of the costates is kept as an affine function of the step of the states, dl_k = S_k dx_k + s_k;
-    forward, the states follow. Initial states are fixed, so dx_0 = 0.
-    """
-
-    factors: Tensor
-    """LU factors of each interval's matrix for (dl_k, dx_{k+1}), (B, K - 1, D, D)."""
-    pivots: Tensor
-    """Pivots of the factors, (B, K - 1, D)."""
-    slopes: Tensor
-    """(dl_k, dx_{k+1}) per dx_k, (B, K - 1, D, D / 2)."""
-    ahead: Tensor
-    """Derivative of each defect in the next costates, (B, K - 1, D, D / 2)."""
-    end: Tensor
-    """S_K, (B, D / 2, D / 2)."""
-
-    def rows(self, index: Tensor) -> Elimination:
-        """The systems at `index`."""
-        return Elimination(*(part[index] for part in self))
-
-    def solve(self, defect: Tensor, terminal_defect: Tensor) -> Tensor:
-        """Step that removes the defects (B, K - 1, D) and (B, D / 2) to first order, (B, K, D)."""
-        half = self.end.shape[-1]
-        defect, shift = defect.to(self.end.dtype), -terminal_defect.to(self.end.dtype)
-        offsets = []
-        for k in reversed(range(defect.shape[1])):
-            known = defect[:, k] + _apply(self.ahead[:, k], shift)
-            offsets.append(
-                -torch.linalg.lu_solve(self.factors[:, k], self.pivots[:, k], known.unsqueeze(-1)).squeeze(-1)
-            )
-            shift = offsets[-1][:, :half]
-        end, state, step = -terminal_defect.to(self.end.dtype), torch.zeros_like(shift), []
-        for k, offset in enumerate(reversed(offsets)):
-            costate, following = (_apply(self.slopes[:, k], state) + offset).split(half, -1)
-            step.append(torch.cat([state, costate], -1))
-            state = following
-        step.append(torch.cat([state, _apply(self.end, state) + end], -1))
-        return torch.stack(step, 1)
-
-
-def eliminate(left: Tensor, right: Tensor, end: Tensor) -> Elimination:
-    """Factorise, from the last interval to the first; arguments as in `Elimination`."""
-    half, slope = end.shape[-1], end
-    factors, pivots, slopes = [], [], []
-    for k in reversed(range(left.shape[1])):
-        matrix = torch.cat([left[:, k, :, half:], right[:, k, :, :half] + right[:, k, :, half:] @ slope], -1)
-        factor, pivot, _ = torch.linalg.lu_factor_ex(matrix)
-        slopes.append(-torch.linalg.lu_solve(factor, pivot, left[:, k, :, :half]))
-        factors.append(factor)
-        pivots.append(pivot)
-        slope = slopes[-1][:, :half]
-    stacked = [torch.stack(part[::-1], 1) for part in (factors, pivots, slopes)]
-    return Elimination(stacked[0], stacked[1], stacked[2], right[..., half:].contiguous(), end)
-
-
-def _apply(matrix: Tensor, vector: Tensor) -> Tensor:
-    return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
-
-
-class Solved(NamedTuple):
-    """Where Newton ended."""
-
-    z: Tensor
-    """Unknowns, (B, K, D)."""
-    residual: Tensor
-    """Largest scaled residuals, (B,)."""
-    status: Tensor
-    """`Status`, (B,)."""
-
-
-def newton(equations: Collocation, start: Iterate, settings: Newton) -> Solved:
-    """Damped Newton; every trajectory stops on its own.
-
-    Derivatives are taken in single precision: it is the defect that must be exact.
-    """
-    rough = Collocation(copy.deepcopy(equations.game).float())
-    return _damped_steps(equations, rough, start, settings)
-
-
-def rescue(equations: Collocation, start: Iterate, found: Solved, rows: Tensor, settings: Newton) -> Solved:
-    """Full steps for stalled trajectories, in double precision: first from where they stalled, then from the start.
-
-    Where controls reach their bounds the equations have kinks. There a residual that must fall at every step stops the
-    search, but full steps carry it through.
-
-    Args:
-        equations: the equations.
-        start: where Newton started.
-        found: where it ended.
-        rows: trajectories to rescue, (R,).
-        settings: the budget.
-    """
-    z, residual, status = (part.clone() for part in found)
-    for origin in (found.z, start.z):
-        rows = rows[status[rows] == Status.STALLED]
-        if len(rows) == 0:
-            break
-        reached, size = _full_steps(equations, Iterate(start.t[rows], origin[rows], start.theta[rows]), settings)
-        done = size <= settings.tolerance
-        z[rows[done]], residual[rows[done]], status[rows[done]] = reached[done], size[done], Status.CONVERGED
-    return Solved(z, residual, status)
-
-
-def _full_steps(equations: Collocation, at: Iterate, settings: Newton) -> tuple[Tensor, Tensor]:
-    """Unknowns and residuals of undamped Newton, when converged or after the last step."""
-    z, residual = at.z.clone(), torch.full_like(at.z[:, 0, 0], torch.inf)
-    for _ in range(settings.full_steps):
-        active = (residual > settings.tolerance).nonzero().squeeze(-1)
-        if len(active) == 0:
-            break
-        part = Iterate(at.t[active], z[active], at.theta[active])
-        z[active] += _direction(equations, equations.linearise(part), part)
-        residual[active] = equations.residual(part._replace(z=z[active]))
-    return z, residual
-
-
-def _direction(equations: Collocation, system: Elimination, at: Iterate) -> Tensor:
-    return system.solve(equations.defect(at), equations.terminal_defect(at)).to(at.z.dtype).nan_to_num(0, 0, 0)
-
-
-def _damped_steps(equations: Collocation, rough: Collocation, start: Iterate, settings: Newton) -> Solved:
-    """Newton with a line search."""
-    z, residual = start.z.clone(), equations.residual(start)
-    status = torch.full_like(residual, Status.MAX_STEPS, dtype=torch.int64)
-    for _ in range(settings.steps):
-        status[residual <= settings.tolerance] = Status.CONVERGED
-        active = (status == Status.MAX_STEPS).nonzero().squeeze(-1)
-        if len(active) == 0:
-            break
-        at = Iterate(start.t[active], z[active], start.theta[active])
-        system = rough.linearise(at)
-        moved, reached = _line_search(equations, system, at, residual[active], settings.halvings)
-        stuck = reached >= residual[active]
-        status[active[stuck]] = Status.STALLED
-        status[active[~reached.isfinite()]] = Status.NOT_FINITE
-        _reuse(equations, system, at._replace(z=moved), reached, (~stuck).nonzero().squeeze(-1), settings)
-        z[active[~stuck]], residual[active[~stuck]] = moved[~stuck], reached[~stuck]
-    status[residual <= settings.tolerance] = Status.CONVERGED
-    return Solved(z, residual, status)
-
-
-def _line_search(
-    equations: Collocation, system: Elimination, at: Iterate, residual: Tensor, halvings: int
-) -> tuple[Tensor, Tensor]:
-    """The longest of the halved Newton steps that lowers the residual, and the residual there."""
-    direction = _direction(equations, system, at)
-    best, reached = at.z.clone(), torch.full_like(residual, torch.inf)
-    searching = torch.arange(len(residual), device=residual.device)
-    for halving in range(halvings + 1):
-        trial = at.rows(searching)._replace(z=at.z[searching] + 0.5**halving * direction[searching])
-        value = equations.residual(trial)
-        lower = value < reached[searching]
-        best[searching[lower]], reached[searching[lower]] = trial.z[lower], value[lower]
-        searching = searching[value >= (1 - 0.1 * 0.5**halving) * residual[searching]]
-        if len(searching) == 0:
-            break
-    return best, reached
-
-
-def _reuse(
-    equations: Collocation, system: Elimination, at: Iterate, residual: Tensor, rows: Tensor, settings: Newton
-) -> None:
-    """Further steps with the same derivatives, in place, for as long as they cut the residual to a fifth.
-
-    They are cheap, so they go on to a hundredth of the tolerance.
-    """
-    for _ in range(settings.reuses):
-        rows = rows[residual[rows] > settings.tolerance / 100]
-        if len(rows) == 0:
-            break
-        part = at.rows(rows)
-        trial = part._replace(z=part.z + _direction(equations, system.rows(rows), part))
-        value = equations.residual(trial)
-        lower = value < residual[rows]
-        good = value < 0.2 * residual[rows]
-        at.z[rows[lower]], residual[rows[lower]] = trial.z[lower], value[lower]
-        rows = rows[good]

@@ -7,7 +7,8 @@ from torch import Tensor
 
 from hno.games import Game
 from hno.pontryagin.certificates import reintegration_error
-from hno.pontryagin.collocation import Collocation, Ends, Iterate, Newton, hermite, newton, rescue
+from hno.pontryagin.collocation import Collocation, Ends, Iterate, hermite
+from hno.pontryagin.newton import Newton, newton, rescue
 from hno.types import Status
 
 PARTS = (1, 8, 2, 4, 8)

@@ -11,9 +11,10 @@ from torch import Tensor
 from hno.games import Game
 from hno.games.base import own_costate
 from hno.pontryagin.certificates import global_gap, local_gap, reintegration_error
-from hno.pontryagin.collocation import Collocation, Iterate, Newton, Solved, newton, rescue
+from hno.pontryagin.collocation import Collocation, Iterate
 from hno.pontryagin.integrate import runge_kutta
 from hno.pontryagin.mesh import graded_mesh, label_places, label_times
+from hno.pontryagin.newton import Newton, Solved, newton, rescue
 from hno.pontryagin.saturation import nodes_at_kinks
 from hno.pontryagin.starts import Search, Starts, find_starts
 from hno.pontryagin.sweep import costates, values

@@ -10,8 +10,9 @@ from torch.autograd.functional import hessian, jacobian
 from hno.games import Box, ControlAffineGame, Game, make
 from hno.pontryagin import Solver, solve
 from hno.pontryagin.certificates import global_gap, local_gap, reintegration_error, replay
-from hno.pontryagin.collocation import Collocation, Iterate, Newton, newton
+from hno.pontryagin.collocation import Collocation, Iterate
 from hno.pontryagin.mesh import label_times
+from hno.pontryagin.newton import Newton, newton
 from hno.pontryagin.solve import solve_on_mesh
 from hno.types import Status
 from tests.lq import LinearQuadratic, open_loop_nash, quadratic, random_game

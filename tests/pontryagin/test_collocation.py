@@ -6,7 +6,9 @@ import pytest
 import torch
 
 from hno.games import make
-from hno.pontryagin.collocation import Collocation, Elimination, Ends, Iterate, Newton, eliminate, hermite, newton
+from hno.pontryagin.collocation import Collocation, Ends, Iterate, hermite
+from hno.pontryagin.elimination import Elimination, eliminate
+from hno.pontryagin.newton import Newton, newton
 from hno.pontryagin.solve import solve_on_mesh
 from hno.types import Status
 from tests.lq import LinearQuadratic
