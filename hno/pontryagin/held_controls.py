@@ -110,7 +110,7 @@ class HeldControls:
         return [(part, self.rows(part)) for part in index]
 
     def _cost_block(self, x: Tensor, v: Tensor) -> Tensor:
-        penalty = self._penalty(self._constraint(self._inside(x)))[0]
+        penalty = self._penalty(self._constraint(self._inside(x)))
         effort = (self.game.effort(self.control(v)) * self.acts.unsqueeze(1)).sum(-1)
         reward = (self.game.terminal_value(x[:, -1]) * self.acts).sum(-1)
         return (self.dt * (effort + penalty.mean(-1))).sum(-1) - reward
@@ -126,14 +126,20 @@ class HeldControls:
             return each.amax(-1) + self.margin
         return each.gather(-1, self.ego[:, None, None, None].expand(*each.shape[:-1], 1)).squeeze(-1) + self.margin
 
-    def _penalty(self, constraint: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The penalty, its derivative and its curvature, at least 0."""
+    def _penalty(self, constraint: Tensor) -> Tensor:
+        """The penalty, or its stand-in in the joint problem."""
+        if self.ego is not None:
+            return self.game.penalty(constraint)
         slope, height = self.game.penalty_slope, self.game.penalty_height
-        active = torch.sigmoid(slope * constraint)
-        bend = height * slope**2 * active * (1 - active)
-        if self.ego is None:
-            return height * torch.nn.functional.softplus(slope * constraint), height * slope * active, bend
-        return self.game.penalty(constraint), bend / slope, (bend * (1 - 2 * active)).clamp_min(0)
+        return height * torch.nn.functional.softplus(slope * constraint)
+
+    def _penalty_slopes(self, constraint: Tensor) -> tuple[Tensor, Tensor]:
+        """Its derivative and its curvature, at least 0."""
+        with torch.enable_grad():
+            point = constraint.detach().requires_grad_()
+            push = gradient_of(self._penalty(point).sum(), point, create_graph=True)
+            bend = gradient_of(push.sum(), point)
+        return push.detach(), bend.clamp_min(0)
 
     def expand(self, x: Tensor, v: Tensor) -> Expansion:
         """Gauss-Newton expansion around a trajectory, (R, N + 1, P, n), (R, N, P, m)."""
@@ -169,7 +175,7 @@ class HeldControls:
             inside = self._inside(x).detach().requires_grad_()
             constraint = self._constraint(inside)
             slope = gradient_of(constraint.sum(), inside).flatten(-2)
-        _, push, bend = self._penalty(constraint.detach())
+        push, bend = self._penalty_slopes(constraint)
         weight = self.dt.unsqueeze(-1) / self.points
         push, bend = (weight * push).unsqueeze(-1), (weight * bend).unsqueeze(-1)
         share = self.share.unsqueeze(-1)

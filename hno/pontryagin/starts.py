@@ -48,7 +48,7 @@ def find_starts(game: Game, start: Tensor, theta: Tensor, search: Search) -> Sta
     """Descend on the joint cost from one manoeuvre per control channel and sign pattern of the players.
 
     Args:
-        game: the game, float64.
+        game: the game, in the precision of the states; single precision is enough.
         start: initial states, (B, P, n).
         theta: player types, (B, P).
         search: settings.
