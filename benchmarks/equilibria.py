@@ -27,6 +27,8 @@ def compare(name: str, starts: int) -> dict[str, Any]:
     x0 = game.initial_box.sample(starts, generator).double()
     theta = torch.randint(1, 6, (starts, game.players), generator=generator).double()
     found = [(row, a) for row in range(starts) for a in attempts(game, x0[row], theta[row]) if a.converged]
+    if not found:
+        raise SystemExit(f"No attempt of the baseline converged on {starts} starts of {name}: ask for more --starts.")
     paths = Iterate(*(torch.cat(part) for part in zip(*(attempt.path for _, attempt in found), strict=True)))
     ours = solve_on_mesh(game, x0, theta)
     with torch.no_grad():

@@ -32,7 +32,7 @@ BATCH = 128
 
 def compare(name: str, starts: int) -> dict[str, Any]:
     """One line of the table."""
-    game, generator = make(name), torch.Generator().manual_seed(1)
+    game, generator = make(name).double(), torch.Generator().manual_seed(1)
     x0 = game.initial_box.sample(BATCH, generator)
     theta = torch.randint(1, 6, (BATCH, game.players), generator=generator).double()
     ours, bare, baseline, solved = [], [], 0.0, 0
@@ -44,7 +44,7 @@ def compare(name: str, starts: int) -> dict[str, Any]:
             began = time.perf_counter()
             accepted = int((solve(game, x0, theta).status == Status.CONVERGED).sum())
             middle = time.perf_counter()
-            converged = int((solve_on_mesh(game.double(), x0.double(), theta).status == Status.CONVERGED).sum())
+            converged = int((solve_on_mesh(game, x0.double(), theta).status == Status.CONVERGED).sum())
             ours.append((middle - began) / max(1, accepted))
             bare.append((time.perf_counter() - middle) / max(1, converged))
     scipy_seconds = baseline / max(1, solved)

@@ -77,9 +77,9 @@ class Status(IntEnum):
 
 _ADVICE = {
     Status.CONVERGED: "the residual is below the tolerance: use it",
-    Status.STALLED: "the residual stopped falling, mostly where controls saturate: try Solver(extra_nodes=120) or more "
-    "starts with Search(rounds=...)",
-    Status.MAX_STEPS: "the residual was still falling: raise Newton(steps=...)",
+    Status.STALLED: "the residual stopped falling, mostly where controls saturate or a constraint has kinks: smooth "
+    "the constraint, or try hno.pontryagin.Solver(extra_nodes=120)",
+    Status.MAX_STEPS: "the residual was still falling: raise Solver(newton=Newton(steps=...))",
     Status.NOT_FINITE: "states or costates grew beyond bounds: check that dynamics and costs are finite around the PDE "
     "box, with hno.games.testing.check_game",
     Status.INACCURATE: "solved on the mesh, but its controls do not lead where its states say: raise "

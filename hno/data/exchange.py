@@ -15,11 +15,14 @@ from torch import Tensor
 from hno.data.store import LabelFileError, read_labels, write_labels
 from hno.games import Game
 from hno.games.base import own_costate
+from hno.pontryagin.adjoint import terminal_costate
 from hno.pontryagin.certificates import global_gap, local_gap, reintegration_error
 from hno.pontryagin.collocation import Collocation, Iterate
 from hno.pontryagin.starts import Search
-from hno.types import Extremal, Status
+from hno.types import Extremal, Status, join
 
+CHUNK = 128
+"""Rows whose certificates are computed together; bounds the memory."""
 REQUIRED = ("t", "x", "costate", "value", "theta")
 """Arrays that labels of your own must have; shapes and units are those of `hno.types.Extremal`."""
 
@@ -41,36 +44,41 @@ def from_arrays(game: Game, arrays: Mapping[str, NDArray[Any]]) -> Extremal:
 
     Raises:
         ValueError: a missing or unknown array, a wrong shape, numbers that are not finite, times that do not increase
-            from 0 to the horizon, or values that do not end at the terminal value.
+            from 0 to the horizon, or values or costates that do not end at the terminal value and its gradient.
     """
     game = copy.deepcopy(game).cpu().double()
     wrong = [name for name in REQUIRED if name not in arrays] + [name for name in arrays if name not in REQUIRED]
     if wrong:
         raise ValueError(f"Labels consist of the arrays {', '.join(REQUIRED)}; missing or unknown: {', '.join(wrong)}.")
     t, x, costate, value, theta = (torch.from_numpy(np.array(arrays[name], dtype=np.float64)) for name in REQUIRED)
-    _check(game, t, x, costate, value, theta)
-    own = own_costate(costate)
-    with torch.no_grad():
-        u = game.best_response(x, own)
-        at = Iterate(t.expand(len(x), -1), torch.cat([x.flatten(-2), own.flatten(-2)], -1), theta)
-        equations, share = Collocation(game), torch.linspace(0, 1, 9, dtype=t.dtype)
-        between = equations.split(equations.interpolate(at, share))[0].flatten(1, 2)
-        along = theta.unsqueeze(1).expand(between.shape[:-1])
-        return Extremal(
-            status=torch.full((len(x),), int(Status.CONVERGED)),
-            residual=torch.full((len(x),), torch.nan, dtype=torch.float64),
-            t=t,
-            x=x,
-            costate=costate,
-            u=u,
-            value=value,
-            theta=theta,
-            clearance=-game.constraint(between, along).amax((1, 2)),
-            reintegration=reintegration_error(game, at),
-            local_gap=local_gap(game, at),
-            global_gap=global_gap(game, x[:, 0], t, u, theta, Search()),
-            alternatives=value[:, 0].sum(-1, keepdim=True),
-        )
+    with torch.inference_mode(False), torch.no_grad():
+        _check(game, t, x, costate, value, theta)
+        rows = (part.split(CHUNK) for part in (x, costate, value, theta))
+        return join([_certified(game, t, *part) for part in zip(*rows, strict=True)])
+
+
+def _certified(game: Game, t: Tensor, x: Tensor, costate: Tensor, value: Tensor, theta: Tensor) -> Extremal:
+    own, equations = own_costate(costate), Collocation(game)
+    u = game.best_response(x, own)
+    at = Iterate(t.expand(len(x), -1), torch.cat([x.flatten(-2), own.flatten(-2)], -1), theta)
+    share = torch.linspace(0, 1, 9, dtype=t.dtype)
+    between = equations.split(equations.interpolate(at, share))[0].flatten(1, 2)
+    along = theta.unsqueeze(1).expand(between.shape[:-1])
+    return Extremal(
+        status=torch.full((len(x),), int(Status.CONVERGED)),
+        residual=torch.full((len(x),), torch.nan, dtype=torch.float64),
+        t=t,
+        x=x,
+        costate=costate,
+        u=u,
+        value=value,
+        theta=theta,
+        clearance=-game.constraint(between, along).amax((1, 2)),
+        reintegration=reintegration_error(game, at),
+        local_gap=local_gap(game, at),
+        global_gap=global_gap(game, x[:, 0], t, u, theta, Search()),
+        alternatives=value[:, 0].sum(-1, keepdim=True),
+    )
 
 
 def _check(game: Game, t: Tensor, x: Tensor, costate: Tensor, value: Tensor, theta: Tensor) -> None:
@@ -95,6 +103,13 @@ def _check(game: Game, t: Tensor, x: Tensor, costate: Tensor, value: Tensor, the
         raise ValueError(
             f"value must end at the game's terminal value -g, it is off by up to {worst:.3g}: values are V = -J, in "
             "reward form, and x is in physical units."
+        )
+    end = terminal_costate(game, x[:, -1])
+    if not torch.allclose(costate[:, -1], end, rtol=1e-3, atol=1e-3 * float(costate.abs().max())):
+        worst = float((costate[:, -1] - end).abs().max())
+        raise ValueError(
+            f"costate must end at the gradient of the terminal value, it is off by up to {worst:.3g}: costates are "
+            "dV_i / dx_j with V = -J."
         )
 
 

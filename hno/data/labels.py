@@ -56,15 +56,15 @@ Report = Callable[[Progress], None]
 
 def default_cache() -> Path:
     """$HNO_CACHE, or the user's cache folder."""
-    fallback = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "hno"
-    return Path(os.environ.get("HNO_CACHE", fallback))
+    fallback = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "hno"
+    return Path(os.environ.get("HNO_CACHE") or fallback)
 
 
 def start_states(game: Game, request: Request) -> Tensor:
     """Uniform start states of a request, float64, (starts, P, n); more of them begin with the fewer."""
-    text = canonical_json({"seed": request.seed, "split": request.split, "theta": request.theta})
+    text = canonical_json({"seed": request.seed, "split": request.split, "theta": [float(t) for t in request.theta]})
     generator = torch.Generator().manual_seed(int(hashlib.sha256(text.encode()).hexdigest()[:15], 16))
-    return game.initial_box.widened(request.widen).cpu().sample(request.starts, generator).double()
+    return game.initial_box.widened(request.widen).cpu().float().sample(request.starts, generator).double()
 
 
 def label_set(game: Game, request: Request, cache: Path, settings: Solver = Solver()) -> LabelSet:
@@ -77,7 +77,7 @@ def label_set(game: Game, request: Request, cache: Path, settings: Solver = Solv
 
 def provenance(game: Game, request: Request, settings: Solver) -> dict[str, Any]:
     """Everything that determines labels, but for how many there are: row k of a set is always the same."""
-    content = request._asdict()
+    content = request._replace(theta=tuple(map(float, request.theta)))._asdict()
     del content["starts"]
     return {
         "game": type(game).__name__,

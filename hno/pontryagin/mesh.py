@@ -34,8 +34,8 @@ def graded_mesh(labels: Tensor, weight: Tensor, extra: int) -> Tensor:
 
 def label_places(t: Tensor, labels: Tensor) -> Tensor:
     """Places of the label times (L,) among the nodes (B, K) of meshes that hold them, (B, L)."""
-    slack = 1e-6 * (labels[1] - labels[0])
-    return torch.searchsorted(t.contiguous(), (labels - slack).expand(len(t), -1).contiguous())
+    slack = 64 * torch.finfo(t.dtype).eps * t[:, -1:]
+    return torch.searchsorted(t.contiguous(), (labels - slack).contiguous())
 
 
 def interpolate(xs: Tensor, ys: Tensor, at: Tensor) -> Tensor:

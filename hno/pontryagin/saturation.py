@@ -65,7 +65,8 @@ def _around(t: Tensor, kinks: Tensor, parts: int) -> list[Tensor]:
     """Nodes that split the intervals with kinks into equal parts."""
     right = torch.searchsorted(t.contiguous(), kinks.contiguous()).clamp_min(1)
     low, high = t.gather(1, right - 1), t.gather(1, right)
-    return [torch.lerp(low, high, k / parts) for k in range(1, parts)]
+    filler = kinks >= t[:, -1:]
+    return [torch.lerp(low, high, k / parts).where(~filler, kinks) for k in range(1, parts)]
 
 
 def _lengthened(part: Tensor, length: int) -> Tensor:

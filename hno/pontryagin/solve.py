@@ -50,9 +50,11 @@ def solve(game: Game, x0: Tensor, theta: Tensor, settings: Solver = Solver()) ->
         ValueError: wrong shapes or entries that are not finite.
     """
     _check(game, x0, theta)
-    game = copy.deepcopy(game).to(x0.device).double()
-    parts = zip(x0.double().split(settings.chunk), theta.double().split(settings.chunk), strict=True)
-    return join([_describe(game, solve_on_mesh(game, *part, settings), settings) for part in parts])
+    with torch.inference_mode(False):  # adjoints are gradients, which that mode would turn into zeros
+        game = copy.deepcopy(game).to(x0.device).double()
+        x0, theta = x0.detach().clone().double(), theta.detach().clone().to(x0.device).double()
+        parts = zip(x0.split(settings.chunk), theta.split(settings.chunk), strict=True)
+        return join([_describe(game, solve_on_mesh(game, *part, settings), settings) for part in parts])
 
 
 def _check(game: Game, x0: Tensor, theta: Tensor) -> None:

@@ -76,6 +76,16 @@ def test_the_same_call_gives_the_same_result_whatever_the_global_generator_holds
         assert torch.equal(one.nan_to_num(7), two.nan_to_num(7)), name
 
 
+def test_inference_mode_changes_nothing():
+    game, theta = make("narrow_road"), types(2, 1, 5)
+    x0 = starts(game, 2)
+    outside = solve(game, x0, theta)
+    with torch.inference_mode():
+        inside = solve(make("narrow_road"), x0.clone(), theta.clone())
+    for name in Extremal._fields:
+        assert torch.equal(getattr(outside, name).nan_to_num(7), getattr(inside, name).nan_to_num(7)), name
+
+
 def test_rows_do_not_influence_each_other():
     game = make("narrow_road")
     x0, theta = starts(game, 3), torch.tensor([[1.0, 1.0], [5.0, 1.0], [3.0, 5.0]], dtype=torch.float64)
