@@ -19,7 +19,7 @@ from typing import Any
 
 import torch
 
-from hno.data.labels import Request, generate
+from hno.data.labels import Request, labels_for
 from hno.games import make
 from hno.pontryagin import solve
 from hno.pontryagin.scipy_reference import solve_one
@@ -64,7 +64,7 @@ def thousand(count: int) -> float:
     """Wall seconds for narrow_road labels of one type on all cores, certificates and files included."""
     with tempfile.TemporaryDirectory() as folder:
         began = time.perf_counter()
-        generate(make("narrow_road"), [Request((3.0, 3.0), count, 0, "train")], Path(folder))
+        labels_for(make("narrow_road"), [Request((3.0, 3.0), count, 0, "train")], Path(folder))
         return time.perf_counter() - began
 
 

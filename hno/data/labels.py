@@ -128,8 +128,16 @@ def labels_for(
         OSError: the cache cannot be written to.
     """
     began = time.perf_counter()
-    generate(game, requests, cache, settings, workers, report)
     sets = [label_set(game, request, cache, settings) for request in requests]
+    jobs = [job for labels, request in zip(sets, requests, strict=True) for job in _jobs(game, labels, request)]
+    total, done, converged = sum(len(job.x0) - job.have for job in jobs), 0, 0
+    for status in _run(game, jobs, settings, workers):
+        done += len(status)
+        converged += int((status == Status.CONVERGED).sum())
+        if report is not None:
+            report(Progress(done, total, converged))
+    for labels in sets:
+        labels.write_manifest()
     found = [labels.read(request.starts) for labels, request in zip(sets, requests, strict=True)]
     return found, time.perf_counter() - began
 
@@ -145,31 +153,13 @@ class _Job(NamedTuple):
     theta: tuple[float, ...]
 
 
-def generate(
-    game: Game,
-    requests: Sequence[Request],
-    cache: Path,
-    settings: Solver = Solver(),
-    workers: int | None = None,
-    report: Report | None = None,
-) -> None:
-    """Solve what the cache lacks of some requests; arguments and errors as for `labels_for`."""
-    jobs = []
-    for request in requests:
-        labels = label_set(game, request, cache, settings)
-        for shard, x0 in enumerate(start_states(game, request).split(SHARD)):
-            have = len(labels.read_shard(shard).status) if labels.rows(shard) else 0  # reading verifies
-            if have < len(x0):
-                labels.check_writable()
-                jobs.append(_Job(labels, shard, x0, have, request.theta))
-    total, done, converged = sum(len(job.x0) - job.have for job in jobs), 0, 0
-    for status in _run(game, jobs, settings, workers):
-        done += len(status)
-        converged += int((status == Status.CONVERGED).sum())
-        if report is not None:
-            report(Progress(done, total, converged))
-    for labels in dict.fromkeys(label_set(game, request, cache, settings) for request in requests):
-        labels.write_manifest()
+def _jobs(game: Game, labels: LabelSet, request: Request) -> Iterator[_Job]:
+    """What a set lacks of a request; what it has is verified."""
+    for shard, x0 in enumerate(start_states(game, request).split(SHARD)):
+        have = len(labels.read_shard(shard).status) if labels.rows(shard) else 0
+        if have < len(x0):
+            labels.check_writable()
+            yield _Job(labels, shard, x0, have, request.theta)
 
 
 def _run(game: Game, jobs: Sequence[_Job], settings: Solver, workers: int | None) -> Iterator[Tensor]:
@@ -190,8 +180,7 @@ def _solve_shard(game: Game, job: _Job, settings: Solver) -> Tensor:
     """Solve the rows that a shard lacks and write it; another process may have done so meanwhile."""
     have = job.labels.rows(job.shard)
     x0 = job.x0[have:]
-    if len(x0) == 0:
-        return job.labels.read_shard(job.shard).status[job.have : len(job.x0)]
-    theta = torch.tensor(job.theta, dtype=torch.float64).expand(len(x0), -1)
-    job.labels.append(job.shard, have, solve(game, x0, theta, settings))
+    if len(x0) > 0:
+        theta = torch.tensor(job.theta, dtype=torch.float64).expand(len(x0), -1)
+        job.labels.append(job.shard, have, solve(game, x0, theta, settings))
     return job.labels.read_shard(job.shard).status[job.have : len(job.x0)]

@@ -37,9 +37,8 @@ class Elimination(NamedTuple):
         offsets = []
         for k in reversed(range(defect.shape[1])):
             known = defect[:, k] + _apply(self.ahead[:, k], shift)
-            offsets.append(
-                -torch.linalg.lu_solve(self.factors[:, k], self.pivots[:, k], known.unsqueeze(-1)).squeeze(-1)
-            )
+            solved = torch.linalg.lu_solve(self.factors[:, k], self.pivots[:, k], known.unsqueeze(-1))
+            offsets.append(-solved.squeeze(-1))
             shift = offsets[-1][:, :half]
         end, state, step = -terminal_defect.to(self.end.dtype), torch.zeros_like(shift), []
         for k, offset in enumerate(reversed(offsets)):

@@ -104,10 +104,9 @@ class HeldControls:
         return torch.cat([part._cost_block(x[index], v[index]) for index, part in self._blocks()])
 
     def _blocks(self) -> list[tuple[Tensor, HeldControls]]:
-        index = torch.arange(len(self.theta), device=self.theta.device).split(
-            max(1, BLOCK // self.steps // self.points)
-        )
-        return [(part, self.rows(part)) for part in index]
+        size = max(1, BLOCK // self.steps // self.points)
+        blocks = torch.arange(len(self.theta), device=self.theta.device).split(size)
+        return [(index, self.rows(index)) for index in blocks]
 
     def _cost_block(self, x: Tensor, v: Tensor) -> Tensor:
         penalty = self._penalty(self._constraint(self._inside(x)))

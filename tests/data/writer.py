@@ -22,7 +22,7 @@ def write(cache: Path, starts: int, workers: int = 1) -> None:
     labels.solve, labels._solve_alone = fake_solve, _solve_alone
     labels.SHARD = shards.SHARD = SHARD
     requests = [labels.Request(theta, starts, 0, "train") for theta in THETAS]
-    labels.generate(make("narrow_road"), requests, cache, workers=workers)
+    labels.labels_for(make("narrow_road"), requests, cache, workers=workers)
 
 
 def _solve_alone(game: Game, job: labels._Job, settings: Solver) -> Tensor:
