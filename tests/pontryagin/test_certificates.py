@@ -210,6 +210,24 @@ def test_passing_on_the_wrong_side_has_a_global_gap_but_no_local_one():
     torch.testing.assert_close(largest_global_gaps(game, wrong), gained, rtol=0.1, atol=0)
 
 
+class Stream(Pillar):
+    """The point is carried towards the pillar."""
+
+    def drift(self, x: Tensor) -> Tensor:
+        return torch.tensor([4.0, 0.0], dtype=x.dtype).expand_as(x)
+
+
+def test_only_a_manoeuvre_finds_the_way_around_a_pillar_straight_ahead():
+    """By symmetry nothing pushes to either side: without manoeuvres the best answer is to stop before the pillar."""
+    game = Stream().double()
+    x0, theta = torch.tensor([[[0.0, 0.0]]], dtype=torch.float64), types(1, 0.0)
+    t = label_times(game, dtype=torch.float64, device=x0.device)
+    straight = torch.zeros(1, len(t), 1, 2, dtype=torch.float64)
+    still = Solver().search._replace(amplitudes=(0.0,))
+    around, before = (1 - global_gap(game, x0, t, straight, theta, search) for search in (Solver().search, still))
+    assert around.item() < 0.3 * before.item()
+
+
 def test_a_game_with_one_optimum_has_no_global_gap():
     game = terminal_game()
     found = solve(game, starts(game, 4), torch.zeros(4, 2))
