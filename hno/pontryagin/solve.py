@@ -95,16 +95,20 @@ def solve_on_mesh(game: Game, x0: Tensor, theta: Tensor, settings: Solver = Solv
         starts.x[:, :, 0] = x0.unsqueeze(1)  # single precision is for the search only
         tried = starts.cost.isfinite()
         tried[:, 0] = True  # where no start is finite, one fails in Newton and carries the status
-        row, column = tried.nonzero().unbind(-1)
-        iterate = _initial_iterate(game, starts.x[row, column], starts.u[row, column], theta[row], settings.extra_nodes)
+        state, start = tried.nonzero().unbind(-1)
+        x, u = starts.x[state, start], starts.u[state, start]
+        iterate = _initial_iterate(game, x, u, theta[state], settings.extra_nodes)
         equations = Collocation(game)
         found = newton(equations, iterate, settings.newton)
         place, converged = _places(tried, found.status)
         hopeless = place[tried & ~converged.any(1, keepdim=True)]
         found = rescue(equations, iterate, found, hopeless, settings.newton)
         best, totals = _best(_total(game, iterate._replace(z=found.z)), found, tried)
-        picked, size, status = iterate._replace(z=found.z).rows(best), found.residual[best], found.status[best]
-        return OnMesh(*nodes_at_kinks(game, picked, size, status, settings.newton, settings.reintegration), totals)
+        row = place.gather(1, best).squeeze(1)
+        picked, size, status = iterate._replace(z=found.z).rows(row), found.residual[row], found.status[row]
+        at, size, status = nodes_at_kinks(game, picked, size, status, settings.newton, settings.reintegration)
+        total = _total(game, at).where(status == Status.CONVERGED, torch.nan)
+        return OnMesh(at, size, status, totals.scatter(1, best, total.unsqueeze(1)))
 
 
 def _initial_iterate(game: Game, x: Tensor, u: Tensor, theta: Tensor, extra: int) -> Iterate:
@@ -175,12 +179,12 @@ def _best(total: Tensor, found: Solved, tried: Tensor) -> tuple[Tensor, Tensor]:
         tried: which starts those are, (B, S).
 
     Returns:
-        The row of each state's best start, (B,), and the totals, NaN where a start did not converge, (B, S).
+        The best start of each state, (B, 1), and the totals, NaN where a start did not converge, (B, S).
     """
     place, converged = _places(tried, found.status)
     totals = torch.where(converged, total[place], torch.nan)
     score = torch.where(converged, totals, -1e30 * (1 + found.residual[place].clamp_max(1e30)))
-    return place.gather(1, score.masked_fill(~tried, -torch.inf).argmax(1, keepdim=True)).squeeze(1), totals
+    return score.masked_fill(~tried, -torch.inf).argmax(1, keepdim=True), totals
 
 
 def _describe(game: Game, found: OnMesh, settings: Solver) -> Extremal:

@@ -248,6 +248,15 @@ def test_every_extremal_carries_its_certificates(name):
     assert found.reintegration.max() <= Solver().reintegration
 
 
+def test_the_label_is_among_its_alternatives_also_after_it_was_solved_again_on_its_kinks():
+    game = make("drone")
+    found = solve(game, starts(game, 16), types(16, 5, 5))
+    solved = found.status == Status.CONVERGED
+    apart = (found.alternatives - found.value[:, :1].sum(-1)).abs().nan_to_num(torch.inf).amin(-1)
+    assert apart[solved].max() < 1e-9
+    assert found.alternatives[~solved & (found.status != Status.INACCURATE)].isnan().all()
+
+
 def test_a_row_whose_controls_lead_elsewhere_is_inaccurate():
     game = make("narrow_road")
     x0, theta = starts(game, 2), types(2, 1, 5)
