@@ -123,6 +123,12 @@ class GameData(L.LightningDataModule):
         self.game = copy.deepcopy(game)  # the operator moves its own to a device; batches are made on the CPU
         self.streams, self.seed = frozenset(streams), seed
         self.own = [read_own(path, game) for path in files]
+        for path, labels in zip(files, self.own, strict=True):
+            if len(labels.status) <= validation:
+                raise ValueError(
+                    f"{path} holds {len(labels.status)} labels and {validation} are held out: none is left to train "
+                    "on. Bring more, or lower data.validation."
+                )
         solved = [tuple(map(float, theta)) for theta in types]
         brought = [tuple(theta) for labels in self.own for theta in labels.theta.unique(dim=0).tolist()]
         self.type_list = list(dict.fromkeys([*solved, *brought]))

@@ -129,8 +129,11 @@ def read_own(path: Path, game: Game) -> Extremal:
     """Read labels that `write_own` or the label cache wrote.
 
     Raises:
+        FileNotFoundError: there is no such file.
         LabelFileError: damaged, or labels of another game or of other constants.
     """
+    if not path.is_file():
+        raise FileNotFoundError(f"There is no label file {path}. Write one with hno.data.exchange.write_own.")
     labels, provenance = read_labels(path)
     found = {name: provenance.get(name) for name in ("game", "fingerprint")}
     if found != _identity(game):

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 import torch
 
+from hno.data import GameData
+from hno.data.curriculum import Curriculum
 from hno.data.exchange import REQUIRED, from_arrays, read_own, to_arrays, write_own
 from hno.data.store import LabelFileError
 from hno.games import make
@@ -78,3 +80,46 @@ def test_files_are_read_for_the_game_they_were_made_for(tmp_path: Path, arrays: 
         read_own(path, make("narrow_road", radius=1.3))
     with pytest.raises(LabelFileError, match="NarrowRoad"):
         read_own(path, make("drone"))
+    with pytest.raises(FileNotFoundError, match=r"no label file .*other\.safetensors"):
+        read_own(tmp_path / "other.safetensors", game)
+
+
+def own_data(path: Path, validation: int, types: list[tuple[float, ...]], cache: Path) -> GameData:
+    sizes = {"bvp": None, "interior": 4, "terminal": 4}
+    shares = {"box": 1.0, "band": 0.0, "labels": 0.0}
+    return GameData(
+        make("narrow_road"),
+        ["bvp"],
+        types,
+        3,
+        cache,
+        0,
+        sizes,
+        Curriculum(0, 0),
+        shares,
+        "labelled",
+        validation,
+        files=[path],
+    )
+
+
+def test_own_labels_alone_are_trained_on_and_held_out(
+    tmp_path: Path, cache: Path, arrays: dict[str, np.ndarray]
+) -> None:
+    game, path = make("narrow_road"), tmp_path / "mine.safetensors"
+    arrays["theta"] = arrays["theta"] * 0 + 1.5
+    labels = from_arrays(game, arrays)
+    write_own(path, game, labels, "a test")
+    data = own_data(path, 1, [], cache)
+    data.prepare_data()
+    data.setup("fit")
+    assert data.type_list == [(1.5, 1.5)]
+    rows, nodes = len(labels.status), len(labels.t)
+    assert (data.train_rows.size, data.val_rows.size) == ((rows - 1) * nodes, nodes)
+    torch.testing.assert_close(data.train_rows.labels.value, labels.value[:-1].flatten(0, 1).float())
+    with pytest.raises(ValueError, match=rf"mine\.safetensors holds {rows} labels and {rows} are held out"):
+        own_data(path, rows, [], cache)
+    with pytest.raises(ValueError, match="no labelled types"):
+        GameData(
+            game, ["bvp"], [], 3, cache, 0, {"bvp": None}, Curriculum(0, 0), {"box": 1.0, "band": 0.0, "labels": 0.0}
+        )
