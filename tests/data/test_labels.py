@@ -49,6 +49,22 @@ def test_different_requests_share_no_start_state(change: dict[str, object]) -> N
     assert not bool((ours.unsqueeze(1) == theirs).any())
 
 
+def test_start_states_do_not_depend_on_the_default_precision() -> None:
+    states = start_states(make("narrow_road"), REQUEST)
+    try:
+        torch.set_default_dtype(torch.float64)
+        assert torch.equal(start_states(make("narrow_road"), REQUEST), states)
+    finally:
+        torch.set_default_dtype(torch.float32)
+
+
+@pytest.mark.parametrize("theta", [(1, 5), (1.0, 5.0)])
+def test_whole_types_are_the_same_as_floats(tmp_path: Path, theta: tuple[float, float]) -> None:
+    game, request = make("narrow_road"), REQUEST._replace(theta=theta)
+    assert torch.equal(start_states(game, request), start_states(game, REQUEST))
+    assert label_set(game, request, tmp_path) == label_set(game, REQUEST, tmp_path)
+
+
 def test_more_starts_begin_with_the_fewer() -> None:
     game = make("narrow_road")
     assert torch.equal(start_states(game, REQUEST._replace(starts=9))[:6], start_states(game, REQUEST))
@@ -112,6 +128,10 @@ def test_cache_folder_comes_from_the_environment(monkeypatch: pytest.MonkeyPatch
     monkeypatch.delenv("HNO_CACHE")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "user"))
     assert default_cache() == tmp_path / "user" / "hno"
+    monkeypatch.setenv("HNO_CACHE", "")
+    assert default_cache() == tmp_path / "user" / "hno"
+    monkeypatch.setenv("XDG_CACHE_HOME", "")
+    assert default_cache() == Path.home() / ".cache" / "hno"
 
 
 Solve = Callable[[Game, Tensor, Tensor, Solver], Extremal]

@@ -233,6 +233,16 @@ def test_reading_a_complete_set_writes_nothing(fill: Fill) -> None:
     ]
 
 
+def test_a_stale_manifest_does_not_keep_a_read_only_set_from_being_read(
+    fill: Fill, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    labels = fill()
+    (labels.folder / MANIFEST).write_text("{}")
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    assert bits(fill(200).read(200)) == bits(rows(200))
+    assert (labels.folder / MANIFEST).read_text() == "{}"
+
+
 @pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write everywhere")
 def test_a_read_only_set_can_be_read(fill: Fill) -> None:
     labels = fill()
