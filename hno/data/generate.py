@@ -87,7 +87,8 @@ def read_options(given: Sequence[str]) -> DictConfig:
     try:
         options = OmegaConf.from_cli([word for word in given if "=" in word])
     except YAMLError as error:
-        raise ValueError(f"The options {' '.join(given)} cannot be read: {error}") from error
+        reason = " ".join(str(error).split())
+        raise ValueError(f"The options {' '.join(given)} cannot be read: {reason}.") from error
     wrong += [str(name) for name in options if name not in DEFAULTS]
     merged = OmegaConf.merge(DEFAULTS, options)
     assert isinstance(merged, DictConfig)

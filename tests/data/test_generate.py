@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import NamedTuple
 
@@ -148,6 +149,7 @@ def test_cache_is_that_of_the_environment_by_default(
         ({"constants.horizon": "-1"}, "horizon of narrow_road must be positive"),
         ({"constants": "5"}, "constants.<name>=<value>"),
         ({"constants": "null"}, "constants.<name>=<value>"),
+        ({"constants.radius": "[1"}, "cannot be read"),
         ({"cache": "/proc/nowhere"}, "Labels cannot be written to /proc/nowhere"),
     ],
     ids=str,
@@ -205,21 +207,34 @@ def test_a_damaged_shard_is_one_line(generate: Generate, folder: Path) -> None:
     assert run.err.count("\n") == 1
 
 
-def test_finished_shards_survive_an_interruption(
-    generate: Generate, monkeypatch: pytest.MonkeyPatch, folder: Path, asked: Asked
+@pytest.mark.parametrize(
+    ("accident", "code", "message"),
+    [
+        (KeyboardInterrupt, 130, "the same command goes on from here"),
+        (BrokenProcessPool, 1, "Finished shards are kept: try fewer workers"),
+    ],
+)
+def test_finished_shards_survive_an_accident(
+    generate: Generate,
+    monkeypatch: pytest.MonkeyPatch,
+    folder: Path,
+    asked: Asked,
+    accident: type[BaseException],
+    code: int,
+    message: str,
 ) -> None:
     solver = label_data.solve
 
     def interrupted(game: Game, x0: Tensor, theta: Tensor, settings: Solver) -> Extremal:
         if asked.total() >= 2 * SHARD:
-            raise KeyboardInterrupt
+            raise accident
         return solver(game, x0, theta, settings)
 
     with monkeypatch.context() as patch:
         patch.setattr(label_data, "solve", interrupted)
         run = generate(n="300")
-    assert run.code == 130
-    assert "the same command goes on from here" in run.err
+    assert run.code == code
+    assert message in run.err
     assert [path.name for path in sorted(sets(folder)[0].glob("shard-*"))] == [
         "shard-00000.safetensors", "shard-00001.safetensors",
     ]  # fmt: skip
