@@ -27,12 +27,13 @@ def double_integrator_drift(x: Tensor) -> Tensor:
 
 
 def separation(positions: Tensor, softness: float = 1e-6) -> Tensor:
-    """Distance of each player to its nearest other player, m, (..., P, d) -> (..., P).
+    """Distance of each player to its nearest other player, m, inf for one alone, (..., P, d) -> (..., P).
 
     Args:
         positions: points in one common frame, m.
         softness: rounds the tip of the cone, m, so that every derivative is finite where players touch.
     """
-    others = (positions.roll(shift, -2) for shift in range(1, positions.shape[-2]))
-    squares = torch.stack([(positions - other).square().sum(-1) for other in others]).amin(0)
-    return (squares + softness**2).sqrt()
+    nearest = torch.full_like(positions[..., 0], torch.inf)
+    for shift in range(1, positions.shape[-2]):
+        nearest = torch.minimum(nearest, (positions - positions.roll(shift, -2)).square().sum(-1))
+    return (nearest + softness**2).sqrt()

@@ -11,7 +11,10 @@ from omegaconf import DictConfig, OmegaConf
 from hno.cli.build import build_data, build_game, build_operator, check_numbers, plain
 from hno.cli.config import choices, config_dir, register_plugins
 from hno.cli.results import config_hash
+from hno.data.exchange import write_own
+from hno.games import make
 from hno.losses import STREAMS
+from tests.fakes import fake_labels
 
 GROUPS = sorted(path.name for path in config_dir().iterdir() if path.is_dir())
 CHOICES = [(group, path.stem) for group in GROUPS for path in sorted((config_dir() / group).glob("*.yaml"))]
@@ -44,6 +47,18 @@ def test_every_experiment_builds_for_every_game_and_operator(experiment: str, ga
     check_numbers(config)
     built = build_operator(config, build_game(config))
     assert build_data(config, built).streams == (STREAMS if operator == "hno" else {"bvp"})
+
+
+def test_own_label_files_reach_the_data(tmp_path: Path) -> None:
+    game, path = make("narrow_road"), tmp_path / "mine.safetensors"
+    write_own(path, game, fake_labels(game, (2.5, 2.5), 12), "a test")
+    config = composed("game=narrow_road", f"data.files=[{path}]", "data.types=[]")
+    check_numbers(config)
+    data = build_data(config, build_operator(config, build_game(config)))
+    assert data.type_list == [(2.5, 2.5)]
+    assert not data.requests
+    with pytest.raises(ValueError, match=r"data.types must list player types"):
+        check_numbers(composed("data.types=[]"))
 
 
 @pytest.mark.parametrize(("game", "operator", "activation"), list(product(GAMES, OPERATORS, ACTIVATIONS)))

@@ -13,7 +13,9 @@ from hno.data import GameData
 from hno.data.curriculum import Curriculum
 from hno.data.exchange import REQUIRED, from_arrays, read_own, to_arrays, write_own
 from hno.data.store import LabelFileError
-from hno.games import make
+from hno.games import Game, make
+from hno.pontryagin.certificates import local_gap
+from hno.pontryagin.collocation import Iterate
 from hno.types import Extremal, Status
 
 
@@ -45,8 +47,16 @@ def test_certificates_are_computed_and_tell_good_from_bad(arrays: dict[str, np.n
 def test_rows_beyond_a_chunk_are_certified_too(arrays: dict[str, np.ndarray], monkeypatch: pytest.MonkeyPatch) -> None:
     game = make("narrow_road")
     whole = from_arrays(game, arrays)
+    sizes: list[int] = []
+
+    def counted(game: Game, at: Iterate) -> torch.Tensor:
+        sizes.append(len(at.t))
+        return local_gap(game, at)
+
     monkeypatch.setattr("hno.data.exchange.CHUNK", 3)
+    monkeypatch.setattr("hno.data.exchange.local_gap", counted)
     torch.testing.assert_close(from_arrays(game, arrays).local_gap, whole.local_gap, rtol=0, atol=1e-9)
+    assert sizes == [3, 1]
 
 
 @pytest.mark.parametrize(

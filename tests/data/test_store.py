@@ -11,7 +11,7 @@ import safetensors.torch
 import torch
 
 from hno.data import store
-from hno.data.store import LabelFileError, canonical_json, read_labels, write_labels
+from hno.data.store import LabelFileError, canonical_json, checksum, read_labels, write_labels
 from hno.games import make
 from hno.types import Extremal
 from tests.fakes import fake_labels
@@ -107,6 +107,13 @@ def test_foreign_safetensors_are_refused(tmp_path: Path) -> None:
     assert "without hno's metadata" in refused(path)
     safetensors.torch.save_file({"weight": torch.zeros(3)}, path, metadata={"hno": "[1, 2"})
     assert "without hno's metadata" in refused(path)
+
+
+def test_a_foreign_file_has_no_checksum(tmp_path: Path) -> None:
+    path = tmp_path / "foreign.safetensors"
+    safetensors.torch.save_file({"status": torch.zeros(2)}, path)
+    with pytest.raises(LabelFileError, match=r"foreign.*carries no checksum"):
+        checksum(path)
 
 
 def test_other_files_are_refused(tmp_path: Path) -> None:
