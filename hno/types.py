@@ -25,6 +25,15 @@ class Points(NamedTuple):
     """Player types, shape (B, P)."""
 
 
+class Types(NamedTuple):
+    """Player types of some points as a table, so that nothing has to search for equal ones on a device."""
+
+    distinct: Tensor
+    """Different types, shape (C, P)."""
+    which: Tensor
+    """Row of the table of each point, int64, shape (B,)."""
+
+
 class Labels(NamedTuple):
     """What an operator is supervised with, at the points of the same row."""
 
@@ -50,6 +59,8 @@ class Sample(NamedTuple):
 
     points: Points
     labels: Labels | None = None
+    types: Types | None = None
+    """The points' theta as a table; None where nobody has made one."""
 
 
 Batch = dict[str, Sample]

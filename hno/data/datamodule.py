@@ -19,7 +19,10 @@ from hno.data.labels import Report, Request, labels_for
 from hno.data.sampling import check_shares, sample_states
 from hno.games import Game
 from hno.pontryagin.solve import Solver
-from hno.types import Batch, Extremal, Labels, Points, Sample, Status, part
+from hno.types import Batch, Extremal, Labels, Points, Sample, Status, Types, part
+
+BOX_TYPES = 32
+"""Types that one batch of collocation points draws from the type box: the branch runs once for each."""
 
 
 class Rows(NamedTuple):
@@ -29,6 +32,8 @@ class Rows(NamedTuple):
     """(R,), (R, P, n), (R, P)."""
     labels: Labels
     """(R, P), (R, P, P, n)."""
+    types: Types
+    """(C, P), (R,)."""
 
     @property
     def size(self) -> int:
@@ -37,7 +42,9 @@ class Rows(NamedTuple):
 
     def at(self, index: Tensor) -> Sample:
         """Rows as a sample."""
-        return Sample(Points(*(part[index] for part in self.points)), Labels(*(part[index] for part in self.labels)))
+        columns = zip((Points, Labels), (self.points, self.labels), strict=True)
+        points, labels = (kind(*(part[index] for part in group)) for kind, group in columns)
+        return Sample(points, labels, self.types._replace(which=self.types.which[index]))
 
 
 class NoLabelsError(RuntimeError):
@@ -58,7 +65,8 @@ def rows_of(game: Game, extremals: Sequence[Extremal]) -> Rows:
         )
     columns = zip(*(_columns(game, e, mask) for e, mask in zip(extremals, good, strict=True)), strict=True)
     tau, x, theta, value, costate = (torch.cat(column).float() for column in columns)
-    return Rows(Points(tau, x, theta), Labels(value, costate))
+    distinct, which = theta.unique(dim=0, return_inverse=True)
+    return Rows(Points(tau, x, theta), Labels(value, costate), Types(distinct, which))
 
 
 def _columns(game: Game, found: Extremal, good: Tensor) -> tuple[Tensor, ...]:
@@ -180,7 +188,7 @@ class GameData(L.LightningDataModule):
             batch["bvp"] = self.train_rows.at(self._row_numbers(generator))
         if self.curriculum.active(step):
             for name in sorted(self.streams & {"interior", "terminal"}):
-                batch[name] = Sample(self._points(name, self.curriculum.window(step), generator))
+                batch[name] = self._collocation(name, self.curriculum.window(step), generator)
         return batch
 
     def _row_numbers(self, generator: torch.Generator) -> Tensor:
@@ -189,15 +197,16 @@ class GameData(L.LightningDataModule):
             return torch.arange(self.train_rows.size)
         return torch.randint(self.train_rows.size, (size,), generator=generator)
 
-    def _points(self, stream: str, window: float, generator: torch.Generator) -> Points:
+    def _collocation(self, stream: str, window: float, generator: torch.Generator) -> Sample:
         size = self.batch_sizes[stream] or self.train_rows.size
+        table = self.types
         if self.interior_types == "box":
-            theta = self.game.type_box.sample(size, generator)
-        else:
-            theta = self.types[torch.randint(len(self.types), (size,), generator=generator)]
+            table = self.game.type_box.sample(BOX_TYPES, generator)
+        which = torch.randint(len(table), (size,), generator=generator)
         labelled = self.train_rows.points.tau, self.train_rows.points.x
-        points = sample_states(self.game, theta, self.shares, labelled, window, generator)
-        return points._replace(tau=torch.zeros_like(points.tau)) if stream == "terminal" else points
+        points = sample_states(self.game, table[which], self.shares, labelled, window, generator)
+        points = points._replace(tau=torch.zeros_like(points.tau)) if stream == "terminal" else points
+        return Sample(points, types=Types(table, which))
 
     def train_dataloader(self) -> DataLoader[Batch]:
         """Batches from the trainer's current step on, without end."""

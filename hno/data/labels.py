@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import inspect
+import math
 import os
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -16,9 +17,10 @@ from torch import Tensor
 
 from hno.data.shards import SHARD, LabelSet
 from hno.data.store import canonical_json
+from hno.data.trust import safe
 from hno.games import Game
 from hno.pontryagin.solve import Solver, solve
-from hno.types import Extremal, Status
+from hno.types import Extremal, Status, part
 
 SOLVER_VERSION = 2
 """Counted up when the solver's results change, which makes cached labels stale."""
@@ -34,7 +36,7 @@ class Request(NamedTuple):
     seed: int
     """Seed of the start states."""
     split: str
-    """What the states are for, "train" or "test": different splits never share states."""
+    """What the states are for, "train", "validation" or "test": different splits never share states."""
     widen: float = 1.0
     """Width of the start box in units of the game's."""
 
@@ -140,6 +142,59 @@ def labels_for(
         labels.write_manifest()
     found = [labels.read(request.starts) for labels, request in zip(sets, requests, strict=True)]
     return found, time.perf_counter() - began
+
+
+def safe_labels_for(
+    game: Game,
+    requests: Sequence[Request],
+    cache: Path,
+    workers: int | None = None,
+    report: Report | None = None,
+    most: int = 4096,
+) -> tuple[list[Extremal], float]:
+    """Labels of as many start states as it takes until `starts` of each request are safe.
+
+    A start is safe where its equilibrium keeps `hno.data.trust.CLEARANCE`.
+
+    Args:
+        game: the game.
+        requests: what is needed; `starts` counts safe ones.
+        cache: folder of label sets.
+        workers: see `labels_for`.
+        report: called as labels are written.
+        most: start states of a type after which the search for safe ones ends.
+
+    Returns:
+        One `Extremal` per request, whose last row is the last safe start that was asked for, and the seconds spent.
+    """
+    wanted = [request.starts for request in requests]
+    sizes, seconds = list(wanted), 0.0
+    while True:
+        asked = [request._replace(starts=size) for request, size in zip(requests, sizes, strict=True)]
+        found, spent = labels_for(game, asked, cache, workers=workers, report=report)
+        seconds += spent
+        masks = [safe(labels) for labels in found]
+        grown = [_enough(*entry, most) for entry in zip(masks, wanted, strict=True)]
+        if grown == sizes:
+            return [
+                part(labels, slice(_last(m, n))) for labels, m, n in zip(found, masks, wanted, strict=True)
+            ], seconds
+        sizes = grown
+
+
+def _enough(mask: Tensor, wanted: int, most: int) -> int:
+    """How many start states promise `wanted` safe ones, from the share of those that are known."""
+    have = int(mask.sum())
+    if have >= wanted:
+        return len(mask)
+    share = (have + 1) / (len(mask) + 1)
+    return max(len(mask), min(most, len(mask) + SHARD * math.ceil((wanted - have) / share / SHARD)))
+
+
+def _last(mask: Tensor, wanted: int) -> int:
+    """Number of rows up to the last safe one that is wanted; all where there are fewer."""
+    places = mask.nonzero().squeeze(-1)
+    return int(places[wanted - 1]) + 1 if len(places) >= wanted else len(mask)
 
 
 class _Job(NamedTuple):

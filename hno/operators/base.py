@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import abc
+import itertools
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, ClassVar
 
 import lightning as L
@@ -15,8 +16,9 @@ from torchmetrics import WeightedMeanAbsolutePercentageError
 from hno.games import Game, games
 from hno.losses import LossTerm, Norm, Scales
 from hno.operators.deeponet import DeepONet
+from hno.pontryagin.adjoint import terminal_costate
 from hno.registry import Registry
-from hno.types import Batch, Field, Points, Sample
+from hno.types import Batch, Field, Points, Sample, Types
 
 operators: Registry[ValueOperator] = Registry("operator", "hno.operators")
 
@@ -43,12 +45,14 @@ class ValueOperator(L.LightningModule, abc.ABC):
         scaled: measure residuals in the sizes of the labels (see `LossTerm.scale`) rather than in physical units.
         width: hidden and output width of trunk and branch.
         depth: hidden layers of trunk and branch.
+        exact_terminal: V = -g + (tau / horizon) N rather than N, so that the boundary condition holds exactly.
         optimizer: needed for training only.
     """
 
     terms: ClassVar[Mapping[str, type[LossTerm]]]
     value_scale: Tensor
     costate_scale: Tensor
+    roles: Tensor
 
     def __init__(
         self,
@@ -59,10 +63,12 @@ class ValueOperator(L.LightningModule, abc.ABC):
         scaled: bool = True,
         width: int = 64,
         depth: int = 4,
+        exact_terminal: bool = False,
         optimizer: Optimizer | None = None,
     ) -> None:
         super().__init__()
-        self.options = {"activation": activation, "width": width, "depth": depth}
+        self.options = {"activation": activation, "width": width, "depth": depth, "exact_terminal": exact_terminal}
+        self.exact_terminal = exact_terminal
         self.seen_types: list[tuple[float, ...]] = []
         self.config_hash = ""
         self.game = game
@@ -76,6 +82,7 @@ class ValueOperator(L.LightningModule, abc.ABC):
             raise ValueError(f"Loss weights must be finite, not negative and not all 0; got {self.weights}.")
         players, states = game.players, game.state_dim
         self.has_roles = len(set(game.roles)) > 1
+        self.register_buffer("roles", torch.tensor(game.roles), persistent=False)
         sensors = game.sensors((game.type_box.lo + game.type_box.hi) / 2).shape[-1]
         self.net = DeepONet(1 + players * states + self.has_roles, sensors, activation, width, depth)
         self.value_error = WeightedMeanAbsolutePercentageError()
@@ -106,41 +113,58 @@ class ValueOperator(L.LightningModule, abc.ABC):
 
     def forward(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
         """V_i, (B,), (B, P, n), (B, P) -> (B, P)."""
-        return self._value(tau.unsqueeze(-1).expand_as(theta), ego_views(self.game.state_box.scale(x)), theta)
+        table = distinct_types(theta)
+        raw = self.net(self._inputs(tau, x).flatten(0, -2), *self._branch(table)).view_as(theta) * self.value_scale
+        if not self.exact_terminal:
+            return raw
+        return self.game.terminal_value(x) + (tau / self.game.horizon).unsqueeze(-1) * raw
 
-    def field(self, points: Points, *, create_graph: bool = False) -> Field:
-        """Value, time derivative and every costate, in one forward and one backward pass for all players.
+    def field(self, points: Points, types: Types | None = None) -> Field:
+        """Value, time derivative and every costate, of all players at once.
+
+        With gradients enabled the result is differentiable in the parameters, but not in the points.
 
         Args:
             points: where, physical units.
-            create_graph: keep the result differentiable in the parameters.
+            types: the points' theta as a table, which is searched for otherwise.
         """
-        with torch.inference_mode(mode=False), torch.enable_grad():
-            tau = points.tau.unsqueeze(-1).expand_as(points.theta).detach().clone().requires_grad_()
-            views = ego_views(self.game.state_box.scale(points.x)).detach().requires_grad_()
-            value = self._value(tau, views, points.theta)
-            slope, per_view = torch.autograd.grad(value.sum(), (tau, views), create_graph=create_graph)
-        costate = ego_views(per_view, inverse=True) * 2 / self.game.state_box.width
-        return Field(value if create_graph else value.detach(), slope, costate)
+        tau, x, theta = points
+        inputs = self._inputs(tau, x).flatten(0, -2).detach()
+        raw, gradient = self.net.value_gradient(inputs, *self._branch(types or distinct_types(theta)))
+        value = raw.view_as(theta) * self.value_scale
+        slope = gradient[:, 0].view_as(theta) * (2 / self.game.horizon) * self.value_scale
+        views = gradient[:, 1 : 1 + x[0].numel()].reshape(*theta.shape, *x.shape[-2:])
+        costate = ego_views(views, inverse=True) * (2 * self.value_scale / self.game.state_box.width)
+        if not self.exact_terminal:
+            return Field(value, slope, costate)
+        share = (tau / self.game.horizon).unsqueeze(-1)
+        slope = value / self.game.horizon + share * slope
+        end = self.game.terminal_value(x), terminal_costate(self.game, x)
+        return Field(end[0] + share * value, slope, end[1] + share[..., None, None] * costate)
 
-    def _value(self, tau: Tensor, views: Tensor, theta: Tensor) -> Tensor:
-        """V_i from each player's own time (B, P), scaled view (B, P, P, n) and the types (B, P)."""
-        inputs = [2 * tau.unsqueeze(-1) / self.game.horizon - 1, views.flatten(-2)]
+    def _inputs(self, tau: Tensor, x: Tensor) -> Tensor:
+        """Trunk inputs of every player, (B, P, inputs): scaled time, scaled states ego-first, and roles that differ."""
+        views = ego_views(self.game.state_box.scale(x)).flatten(-2)
+        times = (2 * tau / self.game.horizon - 1)[..., None, None].expand(*views.shape[:-1], 1)
+        parts = [times, views]
         if self.has_roles:
-            roles = torch.tensor(self.game.roles, dtype=views.dtype, device=views.device)
-            inputs.append(roles.expand_as(tau).unsqueeze(-1))
-        distinct, which = theta.reshape(-1, theta.shape[-1]).unique(dim=0, return_inverse=True)
-        player = torch.arange(theta.shape[-1], device=theta.device)
-        branch = (which.unsqueeze(-1) * len(player) + player).flatten()
-        raw = self.net(torch.cat(inputs, -1).flatten(0, -2), self.game.sensors(distinct).flatten(0, 1), branch)
-        return raw.view_as(tau) * self.value_scale
+            parts.append(self.roles.to(views).unsqueeze(-1).expand(*views.shape[:-1], 1))
+        return torch.cat(parts, -1)
+
+    def _branch(self, types: Types) -> tuple[Tensor, Tensor]:
+        """Distinct branch inputs (C P, S), and which of them each row of the trunk takes, (B P,)."""
+        players = self.game.players
+        which = types.which.reshape(-1, 1) * players + torch.arange(players, device=types.which.device)
+        return self.game.sensors(types.distinct).flatten(0, 1), which.flatten()
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Weighted sum of the norms of the terms whose stream is in the batch."""
         samples = {name: batch[name] for name in sorted(self.streams & batch.keys())}
         sizes = [len(sample.points.tau) for sample in samples.values()]
         points = Points(*(torch.cat(parts) for parts in zip(*(s.points for s in samples.values()), strict=True)))
-        field = self.field(points, create_graph=True)
+        field = self.field(
+            points, tables([sample.types or distinct_types(sample.points.theta) for sample in samples.values()])
+        )
         fields = dict(
             zip(samples, (Field(*part) for part in zip(*(f.split(sizes) for f in field), strict=True)), strict=True)
         )
@@ -161,7 +185,7 @@ class ValueOperator(L.LightningModule, abc.ABC):
         """Weighted absolute percentage errors of values and costates on held-out labels."""
         if sample.labels is None:
             raise ValueError("Validation needs labelled rows; this sample has points only.")
-        field = self.field(sample.points)
+        field = self.field(sample.points, sample.types)
         self.value_error(field.value, sample.labels.value)
         self.costate_error(field.costate.flatten(1), sample.labels.costate.flatten(1))
         self.log_dict({"val/value_error": self.value_error, "val/costate_error": self.costate_error})
@@ -207,3 +231,16 @@ def ego_views(x: Tensor, *, inverse: bool = False) -> Tensor:
     if not inverse:
         return torch.stack([x.roll(-i, -2) for i in range(players)], -3)
     return torch.stack([x[..., i, :, :].roll(i, -2) for i in range(players)], -3)
+
+
+def distinct_types(theta: Tensor) -> Types:
+    """The different types among (B, P) as a table; this waits for the device."""
+    distinct, which = theta.reshape(-1, theta.shape[-1]).unique(dim=0, return_inverse=True)
+    return Types(distinct, which)
+
+
+def tables(parts: Sequence[Types]) -> Types:
+    """One table for several batches of points, one after the other."""
+    offsets = itertools.accumulate((len(part.distinct) for part in parts), initial=0)
+    which = [part.which + offset for part, offset in zip(parts, offsets, strict=False)]
+    return Types(torch.cat([part.distinct for part in parts]), torch.cat(which))

@@ -7,7 +7,8 @@ import itertools
 import torch
 from torch import Tensor, nn
 
-from hno.operators.activations import activations
+from hno.operators.activations import Activation, activations
+from hno.operators.value_gradient import Layer, value_gradient
 
 
 class MLP(nn.Module):
@@ -20,7 +21,7 @@ class MLP(nn.Module):
 
     def __init__(self, sizes: tuple[int, ...], activation: str) -> None:
         super().__init__()
-        self.activation = activations.get(activation)()
+        self.activation: Activation = activations.get(activation)()
         layers = [nn.Linear(a, b) for a, b in itertools.pairwise(sizes)]
         for index, layer in enumerate(layers):
             self.activation.init_(layer, first=index == 0)
@@ -31,6 +32,23 @@ class MLP(nn.Module):
         for layer in self.layers[:-1]:
             z = self.activation(layer(z))
         return self.layers[-1](z)
+
+    def folded(self) -> tuple[list[Layer], Layer]:
+        """Hidden layers whose activation is its core alone, and the last layer, differentiable in the parameters.
+
+        What the activation does to its argument goes into the weights before it, what it does to its result into those
+        after it.
+        """
+        activation, folded = self.activation, list[Layer]()
+        for index, layer in enumerate(self.layers):
+            assert isinstance(layer, nn.Linear)
+            weight, bias = layer.weight, layer.bias
+            if index == 0:
+                folded.append(Layer(weight, bias))
+            else:
+                folded.append(Layer(activation.gain * weight, bias + activation.shift * weight.sum(-1)))
+        hidden = [Layer(activation.factor * weight, activation.factor * bias) for weight, bias in folded[:-1]]
+        return hidden, folded[-1]
 
 
 class DeepONet(nn.Module):
@@ -62,3 +80,14 @@ class DeepONet(nn.Module):
             Shape (R,).
         """
         return torch.linalg.vecdot(self.trunk(y), self.branch(sensors)[which])
+
+    def value_gradient(self, y: Tensor, sensors: Tensor, which: Tensor) -> tuple[Tensor, Tensor]:
+        """Value at each row and its gradient in y, (R,) and (R, trunk_inputs), both differentiable in the parameters.
+
+        The branch's output is folded into the trunk's last layer: rows of one branch input share a linear map.
+        Arguments as in `forward`.
+        """
+        hidden, last = self.trunk.folded()
+        branch = self.branch(sensors)
+        value, gradient = value_gradient(type(self.trunk.activation), y, which, branch @ last.weight, hidden)
+        return value + (branch @ last.bias)[which], gradient

@@ -106,7 +106,7 @@ def test_branch_sees_the_sensors_of_each_row(make_operator: MakeOperator) -> Non
     inputs_of(operator.net.branch, sensors)
     operator.net.register_forward_pre_hook(lambda module, arguments: rows.append(arguments[2]))
     points = random_points(operator.game, 10, types=4)
-    operator.field(points)
+    operator(*points)
     fed = sensors[0][rows[0]].unflatten(0, (10, 2))
     assert torch.equal(fed, operator.game.sensors(points.theta))
 
@@ -153,7 +153,7 @@ def test_field_works_where_gradients_are_switched_off(make_operator: MakeOperato
 
 def test_field_is_differentiable_in_the_weights_on_request(make_operator: MakeOperator) -> None:
     operator = make_operator()
-    field = operator.field(random_points(operator.game), create_graph=True)
+    field = operator.field(random_points(operator.game))
     for part in field:
         (slope,) = torch.autograd.grad(part.square().sum(), operator.net.trunk.layers[0].weight, retain_graph=True)
         assert bool(slope.any())

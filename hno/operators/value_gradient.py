@@ -1,0 +1,147 @@
+"""Value and input gradient of a folded DeepONet as one function that is differentiable in the weights.
+
+The gradient is written as forward operations, and the derivative of both by hand, so that a training step needs one
+pass forward and one backward, not the second-order graph that `autograd.grad(..., create_graph=True)` builds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from hno.operators.activations import Activation
+
+CPU_BLOCK = 1024
+"""Rows that are processed at a time on a CPU: what is kept of them fits into its cache."""
+BLOCK = 2**16
+"""The same elsewhere."""
+KEPT = 2**17
+"""Rows beyond which the backward pass computes intermediate values again, block by block, rather than keep them: memory
+then grows no longer with the batch, but for its inputs and outputs."""
+
+
+class Layer(NamedTuple):
+    """A hidden layer, core(weight h + bias), with everything else of the activation folded in."""
+
+    weight: Tensor
+    """(width, inputs)."""
+    bias: Tensor
+    """(width,)."""
+
+
+class _Block(NamedTuple):
+    """What the derivatives of some rows need, one entry per hidden layer, from the first."""
+
+    inputs: list[Tensor]
+    """h, each (R, inputs), and the last layer's output."""
+    firsts: list[Tensor]
+    """Derivatives of the core."""
+    above: list[Tensor]
+    """dV / d output of the layer; times `firsts` it is dV / d argument of the core."""
+
+
+def value_gradient(
+    activation: type[Activation], y: Tensor, which: Tensor, coefficient: Tensor, layers: Sequence[Layer]
+) -> tuple[Tensor, Tensor]:
+    """<coefficient[which], h> and its gradient in y, where h is what the layers make of y.
+
+    Args:
+        activation: whose core the layers have.
+        y: inputs, (R, inputs); the result is not differentiable in them.
+        which: row of the coefficients, (R,).
+        coefficient: (C, width).
+        layers: hidden layers, from the first.
+
+    Returns:
+        Shapes (R,) and (R, inputs), differentiable in coefficients, weights and biases.
+    """
+    flat = [part for layer in layers for part in layer]
+    value, gradient = _ValueGradient.apply(activation, y, which, coefficient, *flat)  # type: ignore[no-untyped-call]
+    return value, gradient
+
+
+class _ValueGradient(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, activation: type[Activation], y: Tensor, which: Tensor, coefficient: Tensor, *flat: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        layers = _layers(flat)
+        keep = len(y) <= KEPT and any(ctx.needs_input_grad)
+        ctx.activation, ctx.blocks = activation, []
+        ctx.save_for_backward(y, which, coefficient, *flat)
+        values, gradients = [], []
+        for rows, index in _split(y, which):
+            value, gradient, block = _forward(activation, rows, coefficient[index], layers)
+            values.append(value)
+            gradients.append(gradient)
+            ctx.blocks += [block] if keep else []
+        return torch.cat(values), torch.cat(gradients)
+
+    @staticmethod
+    def backward(ctx: Any, *cotangents: Tensor) -> tuple[Tensor | None, ...]:
+        y, which, coefficient, *flat = ctx.saved_tensors
+        layers = _layers(flat)
+        sums = [torch.zeros_like(part) for part in (coefficient, *flat)]
+        parts = zip(_split(y, which), *(part.split(_block(y)) for part in cotangents), strict=True)
+        for number, ((rows, index), dvalue, dgradient) in enumerate(parts):
+            kept = ctx.blocks[number] if ctx.blocks else _forward(ctx.activation, rows, coefficient[index], layers)[2]
+            sums[0].index_add_(0, index, _backward(ctx.activation, kept, layers, dvalue, dgradient, sums[1:]))
+        return None, None, None, *sums
+
+
+def _forward(
+    activation: type[Activation], y: Tensor, coefficient: Tensor, layers: Sequence[Layer]
+) -> tuple[Tensor, Tensor, _Block]:
+    """Value (R,), gradient (R, inputs) and what their derivatives need."""
+    inputs, firsts = [y], []
+    for weight, bias in layers:
+        core, first = activation.core_and_first_(torch.addmm(bias, inputs[-1], weight.mT))
+        inputs.append(core)
+        firsts.append(first)
+    above = [coefficient]
+    for (weight, _), first in zip(reversed(layers), reversed(firsts), strict=True):
+        above.append((above[-1] * first) @ weight)
+    gradient = above.pop()
+    return torch.linalg.vecdot(inputs[-1], coefficient), gradient, _Block(inputs, firsts, above[::-1])
+
+
+def _backward(
+    activation: type[Activation],
+    block: _Block,
+    layers: Sequence[Layer],
+    dvalue: Tensor,
+    dgradient: Tensor,
+    sums: Sequence[Tensor],
+) -> Tensor:
+    """Add the derivatives in the layers to `sums`; return those in each row's coefficient, (R, width)."""
+    curved, dabove = [], dgradient
+    for k, (weight, _) in enumerate(layers):  # along the gradient's own computation, backwards: from the inputs up
+        above, first = block.above[k], block.firsts[k]
+        dbelow = dabove @ weight.mT
+        sums[2 * k].addmm_((above * first).mT, dabove)
+        dabove = dbelow * first
+        curved.append(activation.times_second_(dbelow.mul_(above), block.inputs[k + 1], first))
+    rate = dvalue.unsqueeze(-1)
+    dcoefficient = dabove.addcmul_(rate, block.inputs[-1])
+    dh = rate * block.above[-1]
+    for k in reversed(range(len(layers))):  # then along the value's
+        du = curved[k].addcmul_(dh, block.firsts[k])
+        sums[2 * k].addmm_(du.mT, block.inputs[k])
+        sums[2 * k + 1].add_(du.sum(0))
+        dh = du @ layers[k].weight
+    return dcoefficient
+
+
+def _layers(flat: Sequence[Tensor]) -> list[Layer]:
+    return [Layer(*pair) for pair in zip(flat[::2], flat[1::2], strict=True)]
+
+
+def _block(y: Tensor) -> int:
+    return CPU_BLOCK if y.device.type == "cpu" else BLOCK
+
+
+def _split(y: Tensor, which: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+    return zip(y.split(_block(y)), which.split(_block(y)), strict=True)
