@@ -3,9 +3,9 @@
     python benchmarks/step.py [--game narrow_road] [--rows 16384 2048] [--repeats 15] [--device cpu]
 
 The baseline runs the branch for every row, takes one second-order autograd pass per player, loops over types and steps
-Adam with its default settings. Half of the rows carry labels, three eighths are collocation points, one eighth is at the
-terminal time; batches are in memory before the clock starts. Gradients of both are compared first, relative to each
-tensor's largest entry.
+Adam with its default settings. Half of the rows carry labels, three eighths are collocation points, one eighth is at
+the terminal time; batches are in memory before the clock starts. Gradients of both are compared first, relative to
+each tensor's largest entry.
 """
 
 from __future__ import annotations

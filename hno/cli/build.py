@@ -103,10 +103,11 @@ def cache_folder(choice: str | None) -> Path:
     return Path(choice) if choice is not None else default_cache()
 
 
-def build_trainer(config: DictConfig, folder: Path) -> L.Trainer:
+def build_trainer(config: DictConfig, folder: Path, validation: L.Callback) -> L.Trainer:
     """A trainer that runs for a number of steps and leaves `last.ckpt` in the folder."""
     trainer = config.trainer
     callbacks: Sequence[L.Callback] = [
+        validation,
         checkpoints(folder, trainer.validate_every),
         StopOnDivergence(),
         progress_bar() or StepLines(trainer.print_every),

@@ -17,9 +17,9 @@ from hno.cli.config import run_command
 from hno.cli.logs import label_progress, send_lightning_to_hydra
 from hno.cli.results import Results, config_hash
 from hno.cli.summary import report, show
-from hno.data.labels import Request, labels_for
+from hno.data.labels import Request, labels_for, safe_labels_for
 from hno.evaluation.closed_loop import TypeRow, collision_table
-from hno.evaluation.rollout import control_steps, rollout
+from hno.evaluation.rollout import Disturbance, control_steps, rollout
 from hno.games import Game
 from hno.games.grid import parse_types
 from hno.operators.checkpoint import OperatorPolicy, load_operator
@@ -66,8 +66,8 @@ def _run(config: DictConfig, results: Results) -> None:
     check_evaluation(policy.game, config)
     types = types_to_evaluate(config.theta, policy, config.unseen)
     cache = cache_folder(config.cache)
-    labels = solve_tests(policy.game, types, config.starts, config.seed, cache, config.workers, results)
-    evaluate_policy(policy, labels, results, config.clearance, config.dt)
+    labels = solve_tests(policy.game, types, config, cache, config.workers, results)
+    evaluate_policy(policy, labels, config, results)
     results.update(status="finished")
 
 
@@ -92,29 +92,32 @@ def types_to_evaluate(
 def solve_tests(
     game: Game,
     types: Sequence[tuple[float, ...]],
-    starts: int,
-    seed: int,
+    settings: DictConfig,
     cache: Path,
     workers: int | None,
     results: Results,
 ) -> list[Extremal]:
     """Labels of the test starts of every type, from the cache or solved."""
-    requests = [Request(theta, starts, seed, "test") for theta in types]
-    labels, seconds = labels_for(game, requests, cache, workers=workers, report=label_progress())
+    requests = [Request(theta, settings.starts, settings.seed, "test", float(settings.widen)) for theta in types]
+    solver = safe_labels_for if settings.safe else labels_for
+    labels, seconds = solver(game, requests, cache, workers=workers, report=label_progress())
     results.time("test_labels", seconds)
-    results.update(test_seed=seed)
+    results.update(test_seed=settings.seed)
     return labels
 
 
 def evaluate_policy(
-    policy: OperatorPolicy, labels: Sequence[Extremal], results: Results, clearance: float, dt: float
+    policy: OperatorPolicy, labels: Sequence[Extremal], settings: DictConfig, results: Results
 ) -> list[TypeRow]:
     """Roll out from the starts of the labels, put the table into the results and draw an episode."""
     began = time.perf_counter()
-    table = collision_table(policy.game, policy, labels, policy.operator.seen_types, clearance, dt)
+    disturbance = Disturbance(settings.noise, settings.delay, settings.seed)
+    arguments = settings.clearance, settings.dt, disturbance
+    table = collision_table(policy.game, policy, labels, policy.operator.seen_types, *arguments)
     results.time("evaluation", time.perf_counter() - began)
-    results.update(clearance=clearance, dt=dt, table=[row._asdict() for row in table])
-    draw(policy, labels[0], results.path.parent / "rollout.png", dt)
+    conditions = {name: settings[name] for name in ("clearance", "dt", "widen", "noise", "delay")}
+    results.update(**conditions, table=[row._asdict() for row in table])
+    draw(policy, labels[0], results.path.parent / "rollout.png", settings.dt)
     return table
 
 
@@ -131,12 +134,16 @@ def draw(policy: OperatorPolicy, found: Extremal, path: Path, dt: float, episode
 
 def check_evaluation(game: Game, settings: DictConfig) -> None:
     """Raise ValueError for entries that make no evaluation of the game."""
-    for name, least in (("starts", 1), ("seed", 0), ("workers", 1)):
+    for name, least in (("starts", 1), ("seed", 0), ("workers", 1), ("delay", 0)):
         value = settings.get(name)
         if value is not None and not (isinstance(value, int) and value >= least):
             raise ValueError(f"{name} must be a whole number of at least {least}; got {value!r}.")
-    for name in ("clearance", "dt"):
+    for name in ("clearance", "dt", "noise", "widen"):
         value = settings[name]
         if not (isinstance(value, (int, float)) and math.isfinite(value) and value >= 0):
             raise ValueError(f"{name} must be a finite number of at least 0; got {value!r}.")
+    if settings.widen == 0:
+        raise ValueError("widen must be a positive number; got 0.")
+    if not isinstance(settings.safe, bool):
+        raise ValueError(f"safe must be true or false; got {settings.safe!r}.")
     control_steps(game, settings.dt)

@@ -19,9 +19,17 @@ from hno.cli.evaluate import check_evaluation, evaluate_policy, solve_tests
 from hno.cli.logs import label_progress, send_lightning_to_hydra
 from hno.cli.results import Results, config_hash
 from hno.cli.summary import report, show
+from hno.data import GameData
+from hno.data.datamodule import NoLabelsError
+from hno.data.labels import Request, safe_labels_for
+from hno.data.trust import safe
+from hno.evaluation.callbacks import DivergedError
 from hno.evaluation.closed_loop import TypeRow
+from hno.evaluation.validation import BEST, ClosedLoopValidation
+from hno.games.grid import parse_types
 from hno.losses import Scales
 from hno.operators.checkpoint import check_resumable, load_policy
+from hno.types import Extremal, part
 
 log = logging.getLogger(__name__)
 
@@ -53,6 +61,9 @@ def train(config: DictConfig) -> bool:
     except Exception as error:
         results.update(status="failed", reason=f"{type(error).__name__}: {error}")
         report(error)
+        if isinstance(error, DivergedError) and (folder / BEST).exists():
+            results.update(checkpoint=BEST)
+            log.error("The last good checkpoint is %s.", folder / BEST)
         return False
     except (KeyboardInterrupt, SystemExit):  # Lightning turns the one into the other
         results.update(status="failed", reason="interrupted")
@@ -75,31 +86,67 @@ def _run(config: DictConfig, folder: Path, results: Results) -> None:
     types = list(dict.fromkeys(operator.seen_types + game.validate_types(config.evaluation.types)))
     settings = config.evaluation
     check_evaluation(game, settings)
-    trainer = build_trainer(config, folder)
+    check_validation(config.validation)
     if config.resume is not None:
         check_resumable(config.resume, operator)
 
     data.prepare_data()
     data.setup("fit")
     results.time("labels", data.label_seconds)
-    test = solve_tests(game, types, settings.starts, settings.seed, data.cache, config.data.workers, results)
+    test = solve_tests(game, types, settings, data.cache, config.data.workers, results)
     if config.loss.scaled:
         operator.set_scales(Scales(*data.label_scales()))
 
+    validation = ClosedLoopValidation(
+        validation_labels(config, data, results), folder, config.trainer.validate_every, dt=settings.dt,
+        stop=config.validation.stop_when_safe,
+    )  # fmt: skip
+    trainer = build_trainer(config, folder, validation)
     began = time.perf_counter()
     trainer.fit(operator, datamodule=data, ckpt_path=config.resume, weights_only=True)
     # The callback saves at multiples of trainer.validate_every, which the last step need not be.
     trainer.save_checkpoint(folder / "last.ckpt", weights_only=False)
-    results.time("training", time.perf_counter() - began)
+    results.time("training", time.perf_counter() - began - validation.seconds)
+    results.time("validation", validation.seconds)
     metrics = {name: float(value) for name, value in trainer.callback_metrics.items() if name.startswith("loss/")}
     metrics |= trainer.validate(operator, datamodule=data, verbose=False)[0]
-    results.update(steps=trainer.global_step, checkpoint="last.ckpt", metrics=metrics)
+    checkpoint = BEST if (folder / BEST).exists() else "last.ckpt"
+    results.update(steps=trainer.global_step, checkpoint=checkpoint, metrics=metrics)
 
-    policy = load_policy(folder / "last.ckpt")
-    table = evaluate_policy(policy, test, results, settings.clearance, settings.dt)
+    policy = load_policy(folder / checkpoint)
+    table = evaluate_policy(policy, test, settings, results)
     for logger in trainer.loggers:
         logger.log_metrics(totals(table), step=trainer.global_step)
     results.update(status="finished")
+
+
+def validation_labels(config: DictConfig, data: GameData, results: Results) -> list[Extremal]:
+    """Labels of the safe starts that closed-loop validation plays, one set per type.
+
+    Raises:
+        NoLabelsError: no start has a safe equilibrium.
+    """
+    choice, clearance = config.validation, config.evaluation.clearance
+    found = data.held_out()
+    if choice.types is not None:
+        types = parse_types(data.game, choice.types)
+        requests = [Request(theta, choice.starts, config.seed, "validation") for theta in types]
+        solved = safe_labels_for(data.game, requests, data.cache, config.data.workers, label_progress())
+        found, seconds = solved
+        results.time("validation_labels", seconds)
+    selected = [part(labels, safe(labels, clearance)) for labels in found]
+    selected = [labels for labels in selected if len(labels.status)]
+    if not selected:
+        raise NoLabelsError(
+            "No validation start has a safe equilibrium: raise data.validation, or set validation.types."
+        )
+    return selected
+
+
+def check_validation(choice: DictConfig) -> None:
+    """Raise ValueError for entries that make no validation."""
+    if choice.types is not None and not (isinstance(choice.starts, int) and choice.starts > 0):
+        raise ValueError(f"validation.starts must be a positive whole number; got {choice.starts!r}.")
 
 
 def totals(table: Sequence[TypeRow]) -> dict[str, float]:

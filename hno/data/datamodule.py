@@ -167,7 +167,11 @@ class GameData(L.LightningDataModule):
             self.prepare_data()
         held_out = -self.validation
         self.train_rows = rows_of(self.game, [part(found, slice(held_out)) for found in self.extremals])
-        self.val_rows = rows_of(self.game, [part(found, slice(held_out, None)) for found in self.extremals])
+        self.val_rows = rows_of(self.game, self.held_out())
+
+    def held_out(self) -> list[Extremal]:
+        """Labels that are not trained on, one set per labelled type."""
+        return [part(found, slice(-self.validation, None)) for found in self.extremals]
 
     def label_scales(self) -> tuple[Tensor, Tensor]:
         """Mean absolute value, scalar, and mean absolute costate, (P, P, n), of the training labels.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -15,16 +16,18 @@ class DivergedError(RuntimeError):
 
 
 class StopOnDivergence(L.Callback):
-    """Raise as soon as the loss, or at the end a weight, is not finite.
+    """Raise as soon as the loss, or at the end a weight, is not finite, or the error on held-out labels has exploded.
 
-    The test looks every `every` steps, because it waits for the device.
+    The loss is tested every `every` steps, because the test waits for the device; the error at each validation.
 
     Args:
         every: steps between tests.
+        growth: how many times its smallest value so far the error may become.
     """
 
-    def __init__(self, every: int = 50) -> None:
-        self.every = every
+    def __init__(self, every: int = 50, growth: float = 10.0) -> None:
+        self.every, self.growth = every, growth
+        self.smallest = math.inf
 
     def on_train_batch_end(
         self, trainer: L.Trainer, pl_module: L.LightningModule, outputs: Any, batch: Any, batch_idx: int
@@ -36,12 +39,32 @@ class StopOnDivergence(L.Callback):
                 f"The loss is {float(outputs['loss'])} at step {trainer.global_step}: the training diverged. {_ADVICE}"
             )
 
+    def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Test the error of costates on held-out labels."""
+        error = float(trainer.callback_metrics.get(ERROR, 0.0))
+        self.smallest = min(self.smallest, error)
+        if not error <= self.growth * self.smallest:
+            was = f"; it was {self.smallest:.3g}" if self.smallest < math.inf else ""
+            raise DivergedError(
+                f"The error of costates is {error:.3g} at step {trainer.global_step}{was}: the training diverged. "
+                f"{_ADVICE}"
+            )
+
+    def state_dict(self) -> dict[str, Any]:
+        """The smallest error so far."""
+        return {"smallest": self.smallest}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Go on from it."""
+        self.smallest = state_dict["smallest"]
+
     def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Test the weights, which the last step changed after its loss."""
         if not all(bool(weights.isfinite().all()) for weights in pl_module.parameters()):
             raise DivergedError(f"The last step left weights that are not finite: the training diverged. {_ADVICE}")
 
 
+ERROR = "val/costate_error"
 _ADVICE = "Lower optimizer.lr or set trainer.gradient_clip_val."
 
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from hno.evaluation.metrics import CollisionRate, clopper_pearson
-from hno.evaluation.rollout import Policy, rollout
+from hno.evaluation.rollout import Disturbance, Policy, rollout
 from hno.games import Game
 from hno.types import Extremal, Status
 
@@ -54,6 +54,7 @@ def collision_table(
     seen: Sequence[Sequence[float]],
     clearance: float = 0.02,
     dt: float = 0.02,
+    disturbance: Disturbance = Disturbance(),
 ) -> list[TypeRow]:
     """Roll out a policy from the start states of labels and compare.
 
@@ -64,10 +65,11 @@ def collision_table(
         seen: types that the operator was trained with.
         clearance: what the label must keep for its start to count, m for distance constraints.
         dt: time for which a control is held, s.
+        disturbance: of the controls.
     """
     starts = torch.cat([found.x[:, 0] for found in labels]).float()
     types = torch.cat([found.theta for found in labels]).float()
-    played = rollout(game, policy, starts, types, dt)
+    played = rollout(game, policy, starts, types, dt, disturbance=disturbance)
     sizes = [len(found.status) for found in labels]
     known = {tuple(float(t) for t in theta) for theta in seen}
     parts = (played.clearance.split(sizes), played.distance.split(sizes), played.value.split(sizes))

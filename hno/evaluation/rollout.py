@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,9 +18,27 @@ Policy = Callable[[Tensor, Tensor, Tensor], Tensor]
 """(tau (B,), x (B, P, n), theta (B, P)) -> controls (B, P, m)."""
 
 
+class Disturbance(NamedTuple):
+    """What stands between a policy's answer and the control that is applied."""
+
+    noise: float = 0.0
+    """Standard deviation of Gaussian noise, new at every step, in half widths of the control box."""
+    delay: int = 0
+    """Steps by which controls come late; until the first one comes, it is applied in advance."""
+    seed: int = 0
+    """Of the noise."""
+
+
 @torch.no_grad()
 def rollout(
-    game: Game, policy: Policy, x0: Tensor, theta: Tensor, dt: float = 0.02, substeps: int = 4, points: int = 4
+    game: Game,
+    policy: Policy,
+    x0: Tensor,
+    theta: Tensor,
+    dt: float = 0.02,
+    substeps: int = 4,
+    points: int = 4,
+    disturbance: Disturbance = Disturbance(),
 ) -> Trajectory:
     """Play the game from every start.
 
@@ -31,6 +50,7 @@ def rollout(
         dt: time for which a control is held, s.
         substeps: Runge-Kutta steps within `dt`.
         points: states, interpolated within each of these, at which constraint and penalty are evaluated.
+        disturbance: of the controls.
 
     Raises:
         ValueError: the horizon is not a whole multiple of `dt`.
@@ -38,10 +58,12 @@ def rollout(
     steps = control_steps(game, dt)
     x, value = x0, torch.zeros_like(theta)
     clearance = distance = torch.full_like(theta[:, 0], torch.inf)
-    path, controls = [x], []
+    path, controls, answers = [x], list[Tensor](), list[Tensor]()
+    generator = torch.Generator().manual_seed(disturbance.seed)
     for k in range(steps):
         tau = torch.full_like(theta[:, 0], game.horizon - k * dt)
-        u = policy(tau, x, theta)
+        answers.append(policy(tau, x, theta))
+        u = _disturbed(game, answers[max(0, k - disturbance.delay)], disturbance.noise, generator)
         for _ in range(substeps):
             after = runge_kutta(game, x, u, dt / substeps)
             inner = _between(x, after, points)
@@ -68,6 +90,15 @@ def control_steps(game: Game, dt: float) -> int:
     if round(steps) < 1 or abs(steps - round(steps)) > 1e-6:
         raise ValueError(f"dt must be a positive time that divides the horizon of {game.horizon:g} s; got {dt:g} s.")
     return round(steps)
+
+
+def _disturbed(game: Game, u: Tensor, noise: float, generator: torch.Generator) -> Tensor:
+    """Admissible controls with noise added, (B, P, m)."""
+    if noise == 0:
+        return u
+    box = game.control_box
+    draw = torch.randn(u.shape, generator=generator, dtype=u.dtype).to(u.device)
+    return box.clamp(u + noise * box.width / 2 * draw)
 
 
 def _between(start: Tensor, end: Tensor, points: int) -> Tensor:
