@@ -62,6 +62,19 @@ class Sample(NamedTuple):
     types: Types | None = None
     """The points' theta as a table; None where nobody has made one."""
 
+    @property
+    def size(self) -> int:
+        """Number of rows."""
+        return len(self.points.tau)
+
+    def rows(self, index: Tensor) -> Sample:
+        """Some of the rows."""
+        return Sample(
+            Points(*(column[index] for column in self.points)),
+            None if self.labels is None else Labels(*(column[index] for column in self.labels)),
+            None if self.types is None else self.types._replace(which=self.types.which[index]),
+        )
+
 
 Batch = dict[str, Sample]
 """A training batch: stream name -> sample."""

@@ -72,6 +72,8 @@ def build_operator(config: DictConfig, game: Game) -> ValueOperator:
         weights=plain(config.loss.weights),
         norm=config.loss.norm,
         scaled=config.loss.scaled,
+        balance=config.loss.balance,
+        hardest=config.loss.hardest,
         optimizer=optimizer,
         **options,
     )
@@ -107,9 +109,9 @@ def build_trainer(config: DictConfig, folder: Path, validation: L.Callback) -> L
     """A trainer that runs for a number of steps and leaves `last.ckpt` in the folder."""
     trainer = config.trainer
     callbacks: Sequence[L.Callback] = [
+        StopOnDivergence(min(50, trainer.validate_every)),
         validation,
         checkpoints(folder, trainer.validate_every),
-        StopOnDivergence(),
         progress_bar() or StepLines(trainer.print_every),
     ]
     return L.Trainer(

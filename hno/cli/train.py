@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shutil
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,15 +21,16 @@ from hno.cli.logs import label_progress, send_lightning_to_hydra
 from hno.cli.results import Results, config_hash
 from hno.cli.summary import report, show
 from hno.data import GameData
-from hno.data.datamodule import NoLabelsError
 from hno.data.labels import Request, safe_labels_for
 from hno.data.trust import safe
 from hno.evaluation.callbacks import DivergedError
 from hno.evaluation.closed_loop import TypeRow
 from hno.evaluation.validation import BEST, ClosedLoopValidation
+from hno.games import Game
 from hno.games.grid import parse_types
 from hno.losses import Scales
 from hno.operators.checkpoint import check_resumable, load_policy
+from hno.operators.polish import polish
 from hno.types import Extremal, part
 
 log = logging.getLogger(__name__)
@@ -86,9 +88,13 @@ def _run(config: DictConfig, folder: Path, results: Results) -> None:
     types = list(dict.fromkeys(operator.seen_types + game.validate_types(config.evaluation.types)))
     settings = config.evaluation
     check_evaluation(game, settings)
-    check_validation(config.validation)
+    check_validation(game, config.validation)
+    every, stop = config.trainer.validate_every, config.validation.stop_when_safe
+    validation = ClosedLoopValidation(folder, every, dt=settings.dt, stop=stop)
+    trainer = build_trainer(config, folder, validation)
     if config.resume is not None:
         check_resumable(config.resume, operator)
+        _take_over(Path(config.resume).parent / BEST, folder / BEST)
 
     data.prepare_data()
     data.setup("fit")
@@ -97,13 +103,13 @@ def _run(config: DictConfig, folder: Path, results: Results) -> None:
     if config.loss.scaled:
         operator.set_scales(Scales(*data.label_scales()))
 
-    validation = ClosedLoopValidation(
-        validation_labels(config, data, results), folder, config.trainer.validate_every, dt=settings.dt,
-        stop=config.validation.stop_when_safe,
-    )  # fmt: skip
-    trainer = build_trainer(config, folder, validation)
+    validation.begin(validation_labels(config, data, results))
     began = time.perf_counter()
     trainer.fit(operator, datamodule=data, ckpt_path=config.resume, weights_only=True)
+    if config.trainer.polish:
+        before, after = polish(operator, data.large_batch(trainer.global_step), config.trainer.polish)
+        log.info("L-BFGS: loss %.4g, was %.4g", after, before)
+        validation.consider(trainer, operator)
     # The callback saves at multiples of trainer.validate_every, which the last step need not be.
     trainer.save_checkpoint(folder / "last.ckpt", weights_only=False)
     results.time("training", time.perf_counter() - began - validation.seconds)
@@ -121,11 +127,7 @@ def _run(config: DictConfig, folder: Path, results: Results) -> None:
 
 
 def validation_labels(config: DictConfig, data: GameData, results: Results) -> list[Extremal]:
-    """Labels of the safe starts that closed-loop validation plays, one set per type.
-
-    Raises:
-        NoLabelsError: no start has a safe equilibrium.
-    """
+    """Labels of the safe starts that closed-loop validation plays, one set per type that has any."""
     choice, clearance = config.validation, config.evaluation.clearance
     found = data.held_out()
     if choice.types is not None:
@@ -135,16 +137,19 @@ def validation_labels(config: DictConfig, data: GameData, results: Results) -> l
         found, seconds = solved
         results.time("validation_labels", seconds)
     selected = [part(labels, safe(labels, clearance)) for labels in found]
-    selected = [labels for labels in selected if len(labels.status)]
-    if not selected:
-        raise NoLabelsError(
-            "No validation start has a safe equilibrium: raise data.validation, or set validation.types."
-        )
-    return selected
+    return [labels for labels in selected if len(labels.status)]
 
 
-def check_validation(choice: DictConfig) -> None:
-    """Raise ValueError for entries that make no validation."""
+def _take_over(best: Path, to: Path) -> None:
+    """The best checkpoint of the run that is resumed, where it was written to another folder."""
+    if best.exists() and best.resolve() != to.resolve():
+        shutil.copy2(best, to)
+
+
+def check_validation(game: Game, choice: DictConfig) -> None:
+    """Raise ValueError for entries that make no validation of the game."""
+    if choice.types is not None:
+        parse_types(game, choice.types)
     if choice.types is not None and not (isinstance(choice.starts, int) and choice.starts > 0):
         raise ValueError(f"validation.starts must be a positive whole number; got {choice.starts!r}.")
 

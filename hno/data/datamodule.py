@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import copy
 import hashlib
+import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 import lightning as L
 import torch
@@ -19,40 +20,18 @@ from hno.data.labels import Report, Request, labels_for
 from hno.data.sampling import check_shares, sample_states
 from hno.games import Game
 from hno.pontryagin.solve import Solver
-from hno.types import Batch, Extremal, Labels, Points, Sample, Status, Types, part
+from hno.types import Batch, Extremal, Labels, Points, Sample, Status, Trajectory, Types, part
 
 BOX_TYPES = 32
 """Types that one batch of collocation points draws from the type box: the branch runs once for each."""
-
-
-class Rows(NamedTuple):
-    """Nodes of labelled trajectories, one per row, float32."""
-
-    points: Points
-    """(R,), (R, P, n), (R, P)."""
-    labels: Labels
-    """(R, P), (R, P, P, n)."""
-    types: Types
-    """(C, P), (R,)."""
-
-    @property
-    def size(self) -> int:
-        """Number of rows."""
-        return len(self.points.tau)
-
-    def at(self, index: Tensor) -> Sample:
-        """Rows as a sample."""
-        columns = zip((Points, Labels), (self.points, self.labels), strict=True)
-        points, labels = (kind(*(part[index] for part in group)) for kind, group in columns)
-        return Sample(points, labels, self.types._replace(which=self.types.which[index]))
 
 
 class NoLabelsError(RuntimeError):
     """Not a single label could be solved."""
 
 
-def rows_of(game: Game, extremals: Sequence[Extremal]) -> Rows:
-    """Every node of every converged trajectory.
+def rows_of(game: Game, extremals: Sequence[Extremal]) -> Sample:
+    """Every node of every converged trajectory, one per row, float32.
 
     Raises:
         NoLabelsError: none converged.
@@ -66,7 +45,7 @@ def rows_of(game: Game, extremals: Sequence[Extremal]) -> Rows:
     columns = zip(*(_columns(game, e, mask) for e, mask in zip(extremals, good, strict=True)), strict=True)
     tau, x, theta, value, costate = (torch.cat(column).float() for column in columns)
     distinct, which = theta.unique(dim=0, return_inverse=True)
-    return Rows(Points(tau, x, theta), Labels(value, costate), Types(distinct, which))
+    return Sample(Points(tau, x, theta), Labels(value, costate), Types(distinct, which))
 
 
 def _columns(game: Game, found: Extremal, good: Tensor) -> tuple[Tensor, ...]:
@@ -152,6 +131,8 @@ class GameData(L.LightningDataModule):
         self.validation = validation
         self.label_seconds = 0.0
         self.extremals: list[Extremal] = []
+        self.visited: tuple[Tensor, Tensor] | None = None
+        """Times to go (L,) and states (L, P, n) that the latest validation went through."""
 
     def prepare_data(self) -> None:
         """Solve what the cache lacks."""
@@ -179,21 +160,48 @@ class GameData(L.LightningDataModule):
         A state that hardly matters keeps a thousandth of value / box width, so that dividing by its size is safe.
         """
         labels = self.train_rows.labels
+        assert labels is not None
         value = labels.value.abs().mean()
         value = torch.where(value > 0, value, torch.ones_like(value))
         return value, labels.costate.abs().mean(0).maximum(1e-3 * value / self.game.state_box.width)
 
+    def visit(self, played: Trajectory) -> None:
+        """Take note of where closed-loop episodes went, as far as they stayed finite."""
+        tau = (self.game.horizon - played.t).expand(len(played.x), -1).flatten()
+        x = played.x.flatten(0, 1)
+        finite = x.flatten(1).isfinite().all(-1)
+        if bool(finite.any()):
+            self.visited = (tau[finite].cpu(), x[finite].cpu())
+
+    def state_dict(self) -> dict[str, Any]:
+        """What batches depend on besides the step."""
+        return {} if self.visited is None else dict(zip(("tau", "x"), self.visited, strict=True))
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Go on from it."""
+        self.visited = (state_dict["tau"], state_dict["x"]) if state_dict else None
+
     def batch(self, step: int) -> Batch:
-        """The batch of one step, a pure function of (seed, step, rank)."""
+        """The batch of one step, a pure function of (seed, step, rank), and of `visited` if it is drawn from."""
         rank = self.trainer.global_rank if self.trainer is not None else 0
         generator = torch.Generator().manual_seed(_mix(step, self.seed, rank))
         batch: Batch = {}
         if "bvp" in self.streams:
-            batch["bvp"] = self.train_rows.at(self._row_numbers(generator))
+            batch["bvp"] = self.train_rows.rows(self._row_numbers(generator))
         if self.curriculum.active(step):
             for name in sorted(self.streams & {"interior", "terminal"}):
                 batch[name] = self._collocation(name, self.curriculum.window(step), generator)
         return batch
+
+    def large_batch(self, step: int) -> Batch:
+        """All labelled rows, and collocation points in proportion to the usual batch."""
+        usual = self.batch_sizes
+        factor = math.ceil(self.train_rows.size / (usual["bvp"] or self.train_rows.size))
+        self.batch_sizes = {name: None if name == "bvp" or not size else factor * size for name, size in usual.items()}
+        try:
+            return self.batch(step)
+        finally:
+            self.batch_sizes = usual
 
     def _row_numbers(self, generator: torch.Generator) -> Tensor:
         size = self.batch_sizes["bvp"]
@@ -208,7 +216,8 @@ class GameData(L.LightningDataModule):
             table = self.game.type_box.sample(BOX_TYPES, generator)
         which = torch.randint(len(table), (size,), generator=generator)
         labelled = self.train_rows.points.tau, self.train_rows.points.x
-        points = sample_states(self.game, table[which], self.shares, labelled, window, generator)
+        pools = {"labels": labelled, "rollout": self.visited or labelled}
+        points = sample_states(self.game, table[which], self.shares, pools, window, generator)
         points = points._replace(tau=torch.zeros_like(points.tau)) if stream == "terminal" else points
         return Sample(points, types=Types(table, which))
 
@@ -223,14 +232,14 @@ class GameData(L.LightningDataModule):
 
 
 class _Whole(Dataset[Sample]):
-    def __init__(self, rows: Rows) -> None:
-        self.rows = rows
+    def __init__(self, sample: Sample) -> None:
+        self.sample = sample
 
     def __len__(self) -> int:
         return 1
 
     def __getitem__(self, index: int) -> Sample:
-        return self.rows.at(torch.arange(self.rows.size))
+        return self.sample
 
 
 class _Steps(IterableDataset[Batch]):

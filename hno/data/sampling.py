@@ -11,8 +11,8 @@ from torch import Tensor
 from hno.games import Game
 from hno.types import Points
 
-SOURCES = ("box", "band", "labels")
-"""Uniform in the PDE box; near the surface constraint = 0; around labelled states."""
+SOURCES = ("box", "band", "labels", "rollout")
+"""Uniform in the PDE box; near the surface constraint = 0; around states of labels; of closed-loop episodes."""
 
 
 def check_shares(shares: Mapping[str, float]) -> None:
@@ -29,7 +29,7 @@ def sample_states(
     game: Game,
     theta: Tensor,
     shares: Mapping[str, float],
-    labelled: tuple[Tensor, Tensor],
+    pools: Mapping[str, tuple[Tensor, Tensor]],
     window: float,
     generator: torch.Generator,
     spread: float = 0.05,
@@ -41,10 +41,10 @@ def sample_states(
         game: the game.
         theta: type of each row, (B, P).
         shares: how many points come from each of `SOURCES`, in any unit.
-        labelled: times to go (L,), 0 among them, and states (L, P, n) that points are drawn around.
+        pools: for "labels" and "rollout", times to go (L,), 0 among them, and states (L, P, n) to draw points around.
         window: share of the horizon that tau may reach.
         generator: source of randomness.
-        spread: standard deviation around labelled states, in box widths.
+        spread: standard deviation around the states of a pool, in box widths.
         band: constraint values of the band lie in [-band, 0.2 band], m for distance constraints.
 
     Returns:
@@ -56,12 +56,12 @@ def sample_states(
     x = game.state_box.sample(size, generator)
     target = band * (1.2 * torch.rand(size, generator=generator) - 1)
 
-    times, states = labelled
-    near = (source == SOURCES.index("labels")).nonzero().squeeze(-1)
-    inside = (times <= window * game.horizon).nonzero().squeeze(-1)
-    row = inside[torch.randint(len(inside), (len(near),), generator=generator)]
-    noise = spread * torch.randn(x[near].shape, generator=generator) * game.state_box.width
-    tau[near], x[near] = times[row], game.state_box.clamp(states[row] + noise)
+    for name, (times, states) in pools.items():
+        near = (source == SOURCES.index(name)).nonzero().squeeze(-1)
+        inside = (times <= window * game.horizon).nonzero().squeeze(-1)
+        row = inside[torch.randint(len(inside), (len(near),), generator=generator)]
+        noise = spread * torch.randn(x[near].shape, generator=generator) * game.state_box.width
+        tau[near], x[near] = times[row], game.state_box.clamp(states[row] + noise)
 
     rows = (source == SOURCES.index("band")).nonzero().squeeze(-1)
     x[rows] = onto_band(game, x[rows], theta[rows], target[rows])

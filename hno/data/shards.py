@@ -109,7 +109,8 @@ class LabelSet:
         return [{"file": path.name, "rows": row_count(path), "sha256": checksum(path)} for path in paths]
 
     def _drafts(self) -> list[Path]:
-        return sorted(self.folder.glob(".shard-*.*")) + sorted(self.folder.glob(f".{MANIFEST}.*"))
+        """Our own unfinished files, and those of safetensors, which writes beside the file that it is to write."""
+        return [path for kind in (".shard-*.*", f".{MANIFEST}.*", ".tmp*") for path in sorted(self.folder.glob(kind))]
 
     def _listed(self) -> Any:
         try:

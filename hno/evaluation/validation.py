@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,11 +12,12 @@ import lightning as L
 import torch
 from torch import Tensor
 
-from hno.evaluation.rollout import Policy, rollout
-from hno.games import Game
+from hno.data import GameData
+from hno.evaluation.rollout import rollout
 from hno.operators import ValueOperator
-from hno.operators.checkpoint import OperatorPolicy
-from hno.types import Extremal, part
+from hno.types import Extremal, Points, Trajectory, part
+
+log = logging.getLogger(__name__)
 
 BEST = "best.ckpt"
 """Name of the best checkpoint inside a run's folder."""
@@ -47,9 +49,8 @@ def starts_of(labels: Sequence[Extremal]) -> Starts:
     return Starts(x0, theta, torch.cat([-found.value[:, 0].sum(-1) for found in labels]).float())
 
 
-def score(game: Game, policy: Policy, starts: Starts, dt: float) -> Score:
-    """Play every start; a collision is whatever keeps no positive clearance, NaN too."""
-    played = rollout(game, policy, starts.x0, starts.theta, dt)
+def score(played: Trajectory, starts: Starts) -> Score:
+    """How good episodes are; a collision is whatever keeps no positive clearance, NaN too."""
     excess = -played.value.sum(-1) - starts.cost
     rate = (~(played.clearance > 0)).float().mean()
     return Score(float(rate), float(excess.nan_to_num(torch.inf).median() / starts.cost.median().abs()))
@@ -58,10 +59,9 @@ def score(game: Game, policy: Policy, starts: Starts, dt: float) -> Score:
 class ClosedLoopValidation(L.Callback):
     """Validate in closed loop every so often, keep the best checkpoint, and end the training once it is safe, if asked.
 
-    The first starts of every type are played first; only if none of them collides are all played.
+    It rests unless it is given starts. The first ones of every type are played first; only if none collides are all.
 
     Args:
-        labels: labels of safe starts, one set per type.
         folder: where `best.ckpt` goes.
         every: steps between validations.
         probe: starts per type that are played first.
@@ -69,14 +69,19 @@ class ClosedLoopValidation(L.Callback):
         stop: whether to end the training as soon as no start collides.
     """
 
-    def __init__(
-        self, labels: Sequence[Extremal], folder: Path, every: int, probe: int = 8, dt: float = 0.02, stop: bool = False
-    ) -> None:
-        self.all = starts_of(labels)
-        self.probe = starts_of([part(found, slice(probe)) for found in labels])
-        self.path, self.every, self.dt, self.stop = folder / BEST, every, dt, stop
+    def __init__(self, folder: Path, every: int, probe: int = 8, dt: float = 0.02, stop: bool = False) -> None:
+        self.path, self.every, self.count, self.dt, self.stop = folder / BEST, every, probe, dt, stop
+        self.all: Starts | None = None
         self.best: Score | None = None
         self.seconds = 0.0
+
+    def begin(self, labels: Sequence[Extremal]) -> None:
+        """Play from the starts of these labels, which are safe, one set per type; without any, play nothing."""
+        if not labels:
+            log.info("No validation start has a safe equilibrium: there is no closed-loop validation.")
+            return
+        self.all = starts_of(labels)
+        self.probe = starts_of([part(found, slice(self.count)) for found in labels])
 
     def on_train_batch_end(
         self, trainer: L.Trainer, pl_module: L.LightningModule, outputs: Any, batch: Any, batch_idx: int
@@ -86,21 +91,41 @@ class ClosedLoopValidation(L.Callback):
         step = trainer.global_step
         if step % self.every and step != trainer.max_steps:
             return
-        began = time.perf_counter()
-        found = self.score(pl_module)
+        found = self.consider(trainer, pl_module)
+        if found is None:
+            return
         pl_module.log_dict({"closed_loop/collision_rate": found.collision_rate, "closed_loop/excess": found.excess})
+        if self.stop and found.collision_rate == 0:
+            trainer.should_stop = True
+
+    def consider(self, trainer: L.Trainer, operator: ValueOperator) -> Score | None:
+        """Play, if there are starts, and write `best.ckpt` if nothing was better so far."""
+        if self.all is None:
+            return None
+        began = time.perf_counter()
+        found = self.play(trainer, operator, self.all)
         if self.best is None or found <= self.best:
             self.best = found
             trainer.save_checkpoint(self.path, weights_only=False)
         self.seconds += time.perf_counter() - began
-        if self.stop and found.collision_rate == 0:
-            trainer.should_stop = True
+        return found
 
-    def score(self, operator: ValueOperator) -> Score:
-        """Of the probe if it collides, otherwise of all starts."""
-        policy = OperatorPolicy(operator)
-        found = score(operator.game, policy, self.probe, self.dt)
-        return found if found.collision_rate > 0 else score(operator.game, policy, self.all, self.dt)
+    def play(self, trainer: L.Trainer, operator: ValueOperator, starts: Starts) -> Score:
+        """The score on the probe if that collides, otherwise on all starts; the data are told where the probe went."""
+
+        def policy(tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
+            """As `OperatorPolicy`, but an operator that diverged just collides."""
+            return game.optimal_control(x, operator.field(Points(tau, x, theta)).costate)
+
+        game = operator.game
+        played = rollout(game, policy, self.probe.x0, self.probe.theta, self.dt)
+        data = getattr(trainer, "datamodule", None)
+        if isinstance(data, GameData):
+            data.visit(played)
+        found = score(played, self.probe)
+        if found.collision_rate > 0 or len(starts.cost) == len(self.probe.cost):
+            return found
+        return score(rollout(game, policy, starts.x0, starts.theta, self.dt), starts)
 
     def on_validation_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Start the clock for the errors on held-out labels."""
@@ -115,5 +140,5 @@ class ClosedLoopValidation(L.Callback):
         return {"best": None if self.best is None else list(self.best)}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Go on from it."""
-        self.best = None if state_dict["best"] is None else Score(*state_dict["best"])
+        """Go on from it, where the checkpoint that it belongs to is there."""
+        self.best = Score(*state_dict["best"]) if state_dict["best"] and self.path.exists() else None

@@ -24,7 +24,7 @@ operators: Registry[ValueOperator] = Registry("operator", "hno.operators")
 
 SPEC_KEY = "hno"
 """Checkpoint entry that says how to build the operator."""
-SPEC_FORMAT = 1
+SPEC_FORMAT = 2
 """Version of that entry."""
 
 Optimizer = Callable[[Iterable[nn.Parameter]], Mapping[str, Any]]
@@ -43,6 +43,8 @@ class ValueOperator(L.LightningModule, abc.ABC):
             that one list serves every operator.
         norm: pointwise norm of the residuals, see `Norm`.
         scaled: measure residuals in the sizes of the labels (see `LossTerm.scale`) rather than in physical units.
+        balance: divide every term by its own running mean, so that weights are shares of the gradient of the log loss.
+        hardest: share of the collocation points that count, those of the largest residuals.
         width: hidden and output width of trunk and branch.
         depth: hidden layers of trunk and branch.
         exact_terminal: V = -g + (tau / horizon) N rather than N, so that the boundary condition holds exactly.
@@ -53,6 +55,8 @@ class ValueOperator(L.LightningModule, abc.ABC):
     value_scale: Tensor
     costate_scale: Tensor
     roles: Tensor
+    running: Tensor
+    """Running mean of each term, 0 before its first step."""
 
     def __init__(
         self,
@@ -61,6 +65,8 @@ class ValueOperator(L.LightningModule, abc.ABC):
         weights: Mapping[str, float] | None = None,
         norm: str = "l1",
         scaled: bool = True,
+        balance: bool = False,
+        hardest: float = 1.0,
         width: int = 64,
         depth: int = 4,
         exact_terminal: bool = False,
@@ -74,6 +80,9 @@ class ValueOperator(L.LightningModule, abc.ABC):
         self.game = game
         self.optimizer = optimizer
         self.norm, self.scaled = Norm(norm), scaled
+        if not 0 < hardest <= 1:
+            raise ValueError(f"loss.hardest is a share in (0, 1]; got {hardest!r}.")
+        self.balance, self.hardest = balance, hardest
         self.losses = nn.ModuleDict({name: term() for name, term in self.terms.items()})
         self.weights = {
             name: float(w) for name, w in (weights or dict.fromkeys(self.terms, 1.0)).items() if name in self.terms
@@ -87,6 +96,7 @@ class ValueOperator(L.LightningModule, abc.ABC):
         self.net = DeepONet(1 + players * states + self.has_roles, sensors, activation, width, depth)
         self.value_error = WeightedMeanAbsolutePercentageError()
         self.costate_error = WeightedMeanAbsolutePercentageError()
+        self.register_buffer("running", torch.zeros(len(self.terms)))
         self.register_buffer("value_scale", torch.tensor(1.0))
         self.register_buffer("costate_scale", torch.ones(players, players, states))
 
@@ -159,27 +169,52 @@ class ValueOperator(L.LightningModule, abc.ABC):
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Weighted sum of the norms of the terms whose stream is in the batch."""
-        samples = {name: batch[name] for name in sorted(self.streams & batch.keys())}
-        sizes = [len(sample.points.tau) for sample in samples.values()]
-        points = Points(*(torch.cat(parts) for parts in zip(*(s.points for s in samples.values()), strict=True)))
-        field = self.field(
-            points, tables([sample.types or distinct_types(sample.points.theta) for sample in samples.values()])
-        )
-        fields = dict(
-            zip(samples, (Field(*part) for part in zip(*(f.split(sizes) for f in field), strict=True)), strict=True)
-        )
-        scales = Scales(self.value_scale, self.costate_scale)
-        losses: dict[str, Tensor] = {}
-        for name in self.terms:
-            term = self.term(name)
-            if term.stream in samples and self.weights.get(name, 0) > 0:
-                sample = samples[term.stream]
-                residual = term.residual(self.game, sample, fields[term.stream])
-                losses[name] = self.norm(residual / term.scale(self.game, sample, scales) if self.scaled else residual)
-        total = torch.stack([self.weights[name] * loss for name, loss in losses.items()]).sum()
+        losses = self.loss_terms(batch)
+        total = torch.stack([self.weights[name] * self._balanced(name, loss) for name, loss in losses.items()]).sum()
         self.log_dict({f"loss/{name}": loss.detach() for name, loss in losses.items()})
         self.log("loss/total", total.detach(), prog_bar=True)
         return total
+
+    def loss_terms(self, batch: Batch) -> dict[str, Tensor]:
+        """Norm of each weighted term whose stream is in the batch, scalars by name."""
+        samples = {name: self._selected(name, batch[name]) for name in sorted(self.streams & batch.keys())}
+        sizes = [len(sample.points.tau) for sample in samples.values()]
+        points = Points(*(torch.cat(parts) for parts in zip(*(s.points for s in samples.values()), strict=True)))
+        field = self.field(points, tables([s.types or distinct_types(s.points.theta) for s in samples.values()]))
+        fields = dict(
+            zip(samples, (Field(*part) for part in zip(*(f.split(sizes) for f in field), strict=True)), strict=True)
+        )
+        return {
+            name: self.norm(self._residual(name, samples[self.term(name).stream], fields[self.term(name).stream]))
+            for name in self.terms
+            if self.term(name).stream in samples and self.weights.get(name, 0) > 0
+        }
+
+    def _residual(self, name: str, sample: Sample, field: Field) -> Tensor:
+        """Residual of a term, in sizes of labels if `scaled`."""
+        term = self.term(name)
+        residual = term.residual(self.game, sample, field)
+        if not self.scaled:
+            return residual
+        return residual / term.scale(self.game, sample, Scales(self.value_scale, self.costate_scale))
+
+    def _selected(self, stream: str, sample: Sample) -> Sample:
+        """The collocation points of the largest residuals, if only those count."""
+        if stream != "interior" or self.hardest == 1:
+            return sample
+        with torch.no_grad():
+            residual = self._residual("residual", sample, self.field(sample.points, sample.types))
+        count = max(1, round(self.hardest * len(residual)))
+        return sample.rows(residual.abs().amax(-1).topk(count).indices)
+
+    def _balanced(self, name: str, loss: Tensor) -> Tensor:
+        """A term, divided by its running mean if terms are balanced."""
+        if not self.balance:
+            return loss
+        place = list(self.terms).index(name)
+        before, now = self.running[place], loss.detach()
+        self.running[place] = torch.where(before > 0, torch.lerp(now, before, 0.99), now)
+        return loss / self.running[place].clamp_min(torch.finfo(loss.dtype).tiny)
 
     def validation_step(self, sample: Sample, batch_idx: int) -> None:
         """Weighted absolute percentage errors of values and costates on held-out labels."""

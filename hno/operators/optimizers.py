@@ -3,23 +3,51 @@
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Callable, Iterable
 from typing import Any
 
 import torch
-from pytorch_optimizer import SOAP
+from pytorch_optimizer import SOAP, Muon
 from torch import nn
-from torch.optim.lr_scheduler import CosineAnnealingLR
+from torch.optim.lr_scheduler import LambdaLR
 
 from hno.operators.base import Optimizer
 from hno.registry import UnknownNameError, unknown_name
 
+
+def muon(
+    parameters: Iterable[nn.Parameter],
+    lr: float,
+    momentum: float = 0.95,
+    ns_steps: int = 5,
+    weight_decay: float = 0.0,
+    adamw_lr: float = 3e-3,
+) -> torch.optim.Optimizer:
+    """Muon for matrices, AdamW for biases and slopes.
+
+    Args:
+        parameters: of the net.
+        lr: learning rate of matrices.
+        momentum: of matrices.
+        ns_steps: Newton-Schulz iterations of the orthogonalisation.
+        weight_decay: of matrices.
+        adamw_lr: learning rate of everything else.
+    """
+    matrices, others = list[nn.Parameter](), list[nn.Parameter]()
+    for parameter in parameters:
+        (matrices if parameter.dim() >= 2 else others).append(parameter)
+    groups = [{"params": matrices, "use_muon": True}, {"params": others, "use_muon": False}]
+    return Muon(groups, lr, momentum, weight_decay, ns_steps=ns_steps, adamw_lr=adamw_lr)
+
+
 OPTIMIZERS: dict[str, Callable[..., torch.optim.Optimizer]] = {
     "adam": torch.optim.Adam,
     "adamw": torch.optim.AdamW,
+    "muon": muon,
     "soap": SOAP,
 }
-SCHEDULES = ("constant", "cosine")
+SCHEDULES = ("constant", "cosine", "linear")
 
 
 def make_optimizer(name: str, steps: int, lr: float, schedule: str, final_lr: float, **options: Any) -> Optimizer:
@@ -30,7 +58,7 @@ def make_optimizer(name: str, steps: int, lr: float, schedule: str, final_lr: fl
         steps: length of the run.
         lr: initial learning rate.
         schedule: one of `SCHEDULES`.
-        final_lr: learning rate at the end of the cosine.
+        final_lr: learning rate at the end of a schedule that falls.
         options: further arguments of the optimiser.
 
     Raises:
@@ -49,7 +77,17 @@ def make_optimizer(name: str, steps: int, lr: float, schedule: str, final_lr: fl
         optimizer = OPTIMIZERS[name](parameters, lr=lr, **options)
         if schedule == "constant":
             return {"optimizer": optimizer}
-        cosine = CosineAnnealingLR(optimizer, steps, eta_min=final_lr)
-        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": cosine, "interval": "step"}}
+        falling = _falling(optimizer, steps, final_lr / lr, schedule)
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": falling, "interval": "step"}}
 
     return build
+
+
+def _falling(optimizer: torch.optim.Optimizer, steps: int, end: float, schedule: str) -> LambdaLR:
+    """A schedule that multiplies every group's rate by 1 at the first step and by `end` after the last."""
+
+    def factor(step: int) -> float:
+        done = min(step / steps, 1.0)
+        return end + (1 - end) * ((1 + math.cos(math.pi * done)) / 2 if schedule == "cosine" else 1 - done)
+
+    return LambdaLR(optimizer, factor)

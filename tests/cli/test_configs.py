@@ -88,7 +88,7 @@ def test_paper_recipe_is_the_published_one() -> None:
     assert config.trainer.max_steps == 300_000
     assert (config.optimizer.name, config.optimizer.lr, config.optimizer.schedule) == ("adam", 1e-4, "constant")
     assert config.data.trajectories == 2000
-    assert plain(config.sampler) == {"box": 1.0, "band": 0.0, "labels": 0.0}
+    assert plain(config.sampler) == {"box": 1.0, "band": 0.0, "labels": 0.0, "rollout": 0.0}
     curriculum = build_data(config, build_operator(config, build_game(config))).curriculum
     assert curriculum == (100_000, 200_000)
 

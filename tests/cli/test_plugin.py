@@ -86,8 +86,18 @@ def test_default_types_stay_within_the_game(command: Command) -> None:
 def test_operator_and_activation_registered_in_a_test(command: Command) -> None:
     @activations.register("softsign")
     class Softsign(Activation):
-        def forward(self, z: torch.Tensor) -> torch.Tensor:
-            return torch.nn.functional.softsign(10 * self.slope * z)
+        @staticmethod
+        def core(u: torch.Tensor) -> torch.Tensor:
+            return torch.nn.functional.softsign(u)
+
+        @staticmethod
+        def core_and_first_(u: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+            core = torch.nn.functional.softsign(u)
+            return core, (1 - core.abs()) ** 2
+
+        @staticmethod
+        def times_second_(x: torch.Tensor, core: torch.Tensor, first: torch.Tensor) -> torch.Tensor:
+            return x.mul_(-2 * core.sign() * (1 - core.abs()) * first)
 
         def init_(self, layer: torch.nn.Linear, *, first: bool) -> None:
             torch.nn.init.xavier_normal_(layer.weight)

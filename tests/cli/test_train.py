@@ -72,7 +72,7 @@ def test_results_hold_every_part_of_the_run(command: Command) -> None:
     results = run.results
     assert results.keys() >= KEYS | {"checkpoint", "metrics", "clearance", "dt", "test_seed"}
     assert results["schema"] == 1
-    assert results["seconds"].keys() == {"labels", "training", "test_labels", "evaluation"}
+    assert results["seconds"].keys() == {"labels", "training", "validation", "test_labels", "evaluation"}
     assert all(seconds >= 0 for seconds in results["seconds"].values())
     assert results["versions"].keys() >= {"hno", "python", "torch", "lightning"}
     assert set(results["metrics"]) >= {"loss/total", "val/value_error", "val/costate_error"}
@@ -100,7 +100,7 @@ def test_last_checkpoint_is_that_of_the_last_step(command: Command, steps: int, 
     run = command("train", *SMOKE, f"trainer.max_steps={steps}", f"trainer.validate_every={every}")
     assert run.code == 0, run.text
     assert torch.load(run.folder / "last.ckpt", weights_only=True)["global_step"] == steps
-    assert [path.name for path in run.folder.glob("*.ckpt")] == ["last.ckpt"]
+    assert sorted(path.name for path in run.folder.glob("*.ckpt")) == ["best.ckpt", "last.ckpt"]
 
 
 def test_run_leaves_a_picture_of_an_episode(command: Command, monkeypatch: pytest.MonkeyPatch) -> None:

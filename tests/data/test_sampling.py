@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from hno.data.curriculum import Curriculum
+from hno.data.datamodule import BOX_TYPES
 from hno.data.sampling import check_shares, onto_band
 from hno.games import Game, make
 from tests.data.conftest import TYPES, MakeData
@@ -131,7 +132,7 @@ def test_types_of_collocation_points(make_data: MakeData) -> None:
     labelled, box = types_of(game, make_data, "labelled"), types_of(game, make_data, "box")
     assert {tuple(theta) for theta in labelled.tolist()} == set(TYPES)
     assert bool(game.type_box.contains(box).all())
-    assert len(box.unique(dim=0)) == 500
+    assert len(box.unique(dim=0)) == BOX_TYPES
     assert float(box.min()) < 1.1
     assert float(box.max()) > 4.9
 

@@ -216,7 +216,7 @@ def test_manifest_follows_rows_that_were_added_without_it(fill: Fill) -> None:
 def test_drafts_of_killed_writers_are_removed(fill: Fill) -> None:
     labels = fill()
     before = files(labels)
-    for name in (".shard-00001.safetensors.ab12", f".{MANIFEST}.cd34"):
+    for name in (".shard-00001.safetensors.ab12", f".{MANIFEST}.cd34", ".tmpjbPa4K"):
         (labels.folder / name).write_bytes(b"half a file")
     fill()
     assert files(labels) == before
