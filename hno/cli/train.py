@@ -14,7 +14,7 @@ import wandb
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from hno.cli.build import build_data, build_game, build_operator, build_trainer, check_numbers
+from hno.cli.build import build_data, build_game, build_operator, build_trainer, cache_folder, check_numbers
 from hno.cli.config import run_command
 from hno.cli.evaluate import check_evaluation, evaluate_policy, solve_tests
 from hno.cli.logs import label_progress, send_lightning_to_hydra
@@ -77,20 +77,32 @@ def train(config: DictConfig) -> bool:
 
 
 def _run(config: DictConfig, folder: Path, results: Results) -> None:
+    settings = config.evaluation
+    game = build_game(config)
+    check_evaluation(game, settings)
+    unseen = game.validate_types(settings.types)
+    trainer = fit(config, folder, results)
+    policy = load_policy(folder / results.content["checkpoint"])
+    types = list(dict.fromkeys([*policy.operator.seen_types, *unseen]))
+    test = solve_tests(game, types, settings, cache_folder(config.data.cache), config.data.workers, results)
+    table = evaluate_policy(policy, test, settings, results)
+    for logger in trainer.loggers:
+        logger.log_metrics(totals(table), step=trainer.global_step)
+    results.update(status="finished")
+
+
+def fit(config: DictConfig, folder: Path, results: Results) -> L.Trainer:
+    """Solve labels and train; the folder gets `last.ckpt` and `best.ckpt`, the results how it went and which to use."""
     check_numbers(config)
     L.seed_everything(config.seed, verbose=False)
     if config.trainer.threads is not None:
         torch.set_num_threads(config.trainer.threads)
-    game = build_game(config)
-    operator = build_operator(config, game)
+    operator = build_operator(config, build_game(config))
     data = build_data(config, operator, label_progress())
-    operator.seen_types, operator.config_hash = data.type_list, results.content["config_hash"]
-    types = list(dict.fromkeys(operator.seen_types + game.validate_types(config.evaluation.types)))
-    settings = config.evaluation
-    check_evaluation(game, settings)
-    check_validation(game, config.validation)
+    operator.seen_types, operator.config_hash = data.type_list, config_hash(config)
+    check_validation(data.game, config.validation)
     every, stop = config.trainer.validate_every, config.validation.stop_when_safe
-    validation = ClosedLoopValidation(folder, every, dt=settings.dt, stop=stop)
+    validation = ClosedLoopValidation(folder, every, dt=config.evaluation.dt, stop=stop)
     trainer = build_trainer(config, folder, validation)
     if config.resume is not None:
         check_resumable(config.resume, operator)
@@ -99,11 +111,10 @@ def _run(config: DictConfig, folder: Path, results: Results) -> None:
     data.prepare_data()
     data.setup("fit")
     results.time("labels", data.label_seconds)
-    test = solve_tests(game, types, settings, data.cache, config.data.workers, results)
     if config.loss.scaled:
         operator.set_scales(Scales(*data.label_scales()))
-
     validation.begin(validation_labels(config, data, results))
+
     began = time.perf_counter()
     trainer.fit(operator, datamodule=data, ckpt_path=config.resume, weights_only=True)
     if config.trainer.polish:
@@ -118,12 +129,7 @@ def _run(config: DictConfig, folder: Path, results: Results) -> None:
     metrics |= trainer.validate(operator, datamodule=data, verbose=False)[0]
     checkpoint = BEST if (folder / BEST).exists() else "last.ckpt"
     results.update(steps=trainer.global_step, checkpoint=checkpoint, metrics=metrics)
-
-    policy = load_policy(folder / checkpoint)
-    table = evaluate_policy(policy, test, settings, results)
-    for logger in trainer.loggers:
-        logger.log_metrics(totals(table), step=trainer.global_step)
-    results.update(status="finished")
+    return trainer
 
 
 def validation_labels(config: DictConfig, data: GameData, results: Results) -> list[Extremal]:
