@@ -2,10 +2,10 @@
 
     python benchmarks/recipes.py --set hypothesis --games lane_change --seeds 0 1 2
 
-Sets of recipes are in `RECIPES`; `--recipe "name: overrides"` adds one. Runs that are there are not repeated: each keeps
-its results in `outputs/recipes/<set>/<game>/<recipe>/<seed>/`. Recipes are chosen on validation starts
-(`--suites validation`); the other suites use test starts. All of them count starts whose equilibrium keeps 2 cm. Prints
-a table per game, with counts pooled over seeds and 95 % intervals, and as its last line one JSON object.
+Sets of recipes are in `RECIPES`; `--recipe "name: overrides"` adds one. Runs that are there are not repeated: each
+keeps its results in `outputs/recipes/<set>/<game>/<recipe>/<seed>/`. Recipes are chosen on validation starts
+(`--suites validation`); the other suites use test starts. All of them count starts whose equilibrium keeps 2 cm.
+Prints a table per game, with counts pooled over seeds and 95 % intervals, and as its last line one JSON object.
 """
 
 from __future__ import annotations
