@@ -75,6 +75,15 @@ MOST = {"half types": 256, "beyond": 512, "1.5 x box": 256, "2 x box": 256}
 CORNERS = "data.types=[[1,1],[1,5],[5,1],[5,5]]"
 BOX = "operator=hno data.interior_types=box"
 RECIPES: dict[str, dict[str, str]] = {
+    "hypothesis": {
+        "sno": "operator=sno",
+        "hno": "operator=hno",
+        "sno, time of hno": "operator=sno trainer.max_steps=2450",
+        "sno, corners": f"{CORNERS} operator=sno data.trajectories=200",
+        "hno, corners": f"{CORNERS} operator=hno data.trajectories=200",
+        "sno, corners, 50": f"{CORNERS} operator=sno data.trajectories=50",
+        "hno, corners, 50": f"{CORNERS} operator=hno data.trajectories=50",
+    },
     "corners": {
         "sno": f"{CORNERS} operator=sno",
         "hno": f"{CORNERS} operator=hno",

@@ -128,7 +128,8 @@ def fit(config: DictConfig, folder: Path, results: Results) -> L.Trainer:
     metrics = {name: float(value) for name, value in trainer.callback_metrics.items() if name.startswith("loss/")}
     metrics |= trainer.validate(operator, datamodule=data, verbose=False)[0]
     checkpoint = BEST if (folder / BEST).exists() else "last.ckpt"
-    results.update(steps=trainer.global_step, checkpoint=checkpoint, metrics=metrics)
+    best = None if validation.best is None else validation.best._asdict()
+    results.update(steps=trainer.global_step, checkpoint=checkpoint, metrics=metrics, validation=best)
     return trainer
 
 
