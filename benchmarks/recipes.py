@@ -73,6 +73,8 @@ MOST = {"half types": 256, "beyond": 512, "1.5 x box": 256, "2 x box": 256}
 """Start states of a type after which the search for safe ones ends, where it is not 4096."""
 
 CORNERS = "data.types=[[1,1],[1,5],[5,1],[5,5]]"
+SHORT = "operator=sno trainer.max_steps=1000"
+FIFTEEN = str([[a, b] for a, b in itertools.combinations_with_replacement(range(1, 6), 2)]).replace(" ", "")
 BOX = "operator=hno data.interior_types=box"
 RECIPES: dict[str, dict[str, str]] = {
     "hypothesis": {
@@ -83,6 +85,46 @@ RECIPES: dict[str, dict[str, str]] = {
         "hno, corners": f"{CORNERS} operator=hno data.trajectories=200",
         "sno, corners, 50": f"{CORNERS} operator=sno data.trajectories=50",
         "hno, corners, 50": f"{CORNERS} operator=hno data.trajectories=50",
+    },
+    "activations": {
+        f"{name} {rate}": f"operator=sno activation={name} optimizer.lr={rate} trainer.max_steps=1000"
+        for name, rate in itertools.product(
+            ("tanh", "relu", "sin", "sin activation.frequency=10", "sin activation.frequency=5"), (3e-3, 1e-2, 3e-2)
+        )
+    },
+    "optimizers": {
+        "soap 1e-2": f"{SHORT}",
+        "soap 3e-3": f"{SHORT} optimizer.lr=3e-3",
+        "soap 1e-2, polish": f"{SHORT} trainer.polish=100",
+        "soap 1e-2, linear": f"{SHORT} optimizer.schedule=linear",
+        "soap 1e-2, clip 1": f"{SHORT} trainer.gradient_clip_val=1.0",
+        "adam 3e-3": f"{SHORT} optimizer=adam",
+        "adam 1e-2": f"{SHORT} optimizer=adam optimizer.lr=1e-2",
+        "adamw 1e-2": f"{SHORT} optimizer=adamw optimizer.lr=1e-2",
+        "muon 2e-2": f"{SHORT} optimizer=muon",
+    },
+    "losses": {
+        "huber": f"{SHORT} loss.norm=huber",
+        "l2": f"{SHORT} loss.norm=l2",
+        "free terminal value": f"{SHORT} operator.exact_terminal=false",
+        "balance": f"{SHORT} loss.balance=true",
+        "costate 3": f"{SHORT} loss.weights.costate=3",
+        "physical units": f"{SHORT} loss.scaled=false",
+        "batch 1024, twice the steps": f"{SHORT} data.batch_sizes.bvp=1024 trainer.max_steps=2000",
+        "batch 4096, half the steps": f"{SHORT} data.batch_sizes.bvp=4096 trainer.max_steps=500",
+    },
+    "samplers": {
+        "mixed": f"{SHORT} operator=hno",
+        "uniform": f"{SHORT} operator=hno sampler=uniform",
+        "band": f"{SHORT} operator=hno sampler=band",
+        "labels": f"{SHORT} operator=hno sampler=labels",
+        "rollout": f"{SHORT} operator=hno sampler=rollout",
+        "hardest quarter": f"{SHORT} operator=hno loss.hardest=0.25",
+    },
+    "types": {
+        "4 types x 280": f"{SHORT} {CORNERS} data.trajectories=280",
+        "7 types x 160": SHORT,
+        "15 types x 75": f"{SHORT} data.trajectories=75 data.types={FIFTEEN}",
     },
     "corners": {
         "sno": f"{CORNERS} operator=sno",
@@ -192,7 +234,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--recipe", action="append", default=[], help='"name: overrides"')
     parser.add_argument("--only", nargs="+", help="names of recipes of the set")
-    parser.add_argument("--suites", nargs="+", default=["validation"], choices=sorted(SUITES))
+    parser.add_argument("--suites", nargs="*", default=["validation"], choices=sorted(SUITES))
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--out", type=Path, default=Path("outputs/recipes"))
     arguments = parser.parse_args()

@@ -66,9 +66,11 @@ def build_operator(config: DictConfig, game: Game) -> ValueOperator:
     optimizer = make_optimizer(steps=config.trainer.max_steps, **plain(config.optimizer))
     for term in config.loss.weights:
         losses.get(term)  # refuses a weight of a term that does not exist
+    activation = plain(config.activation)
     return cls(
         game,
-        activation=config.activation.name,
+        activation=activation.pop("name"),
+        activation_options=activation,
         weights=plain(config.loss.weights),
         norm=config.loss.norm,
         scaled=config.loss.scaled,

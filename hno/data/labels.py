@@ -26,6 +26,10 @@ SOLVER_VERSION = 2
 """Counted up when the solver's results change, which makes cached labels stale."""
 
 
+MORE = 16
+"""Start states by whose multiples a search for safe ones grows."""
+
+
 class Request(NamedTuple):
     """A set of labels: `starts` start states of one type, drawn by `seed`."""
 
@@ -188,7 +192,7 @@ def _enough(mask: Tensor, wanted: int, most: int) -> int:
     if have >= wanted:
         return len(mask)
     share = (have + 1) / (len(mask) + 1)
-    return max(len(mask), min(most, len(mask) + SHARD * math.ceil((wanted - have) / share / SHARD)))
+    return max(len(mask), min(most, len(mask) + MORE * math.ceil((wanted - have) / share / MORE)))
 
 
 def _last(mask: Tensor, wanted: int) -> int:

@@ -136,6 +136,8 @@ class Sin(Activation):
 
     def __init__(self, frequency: float = 30.0) -> None:
         super().__init__()
+        if not (math.isfinite(frequency) and frequency > 0):
+            raise ValueError(f"activation.frequency must be a positive number; got {frequency!r}.")
         self.frequency = frequency
 
     @property

@@ -6,6 +6,7 @@ import abc
 import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, ClassVar
 
 import lightning as L
@@ -39,6 +40,7 @@ class ValueOperator(L.LightningModule, abc.ABC):
     Args:
         game: the game.
         activation: registered name.
+        activation_options: arguments of the activation, such as the frequency of sin.
         weights: weight of each term by name; terms that are not named weigh 0, names without a term are ignored, so
             that one list serves every operator.
         norm: pointwise norm of the residuals, see `Norm`.
@@ -62,6 +64,7 @@ class ValueOperator(L.LightningModule, abc.ABC):
         self,
         game: Game,
         activation: str = "tanh",
+        activation_options: Mapping[str, float] = MappingProxyType({}),
         weights: Mapping[str, float] | None = None,
         norm: str = "l1",
         scaled: bool = True,
@@ -73,7 +76,13 @@ class ValueOperator(L.LightningModule, abc.ABC):
         optimizer: Optimizer | None = None,
     ) -> None:
         super().__init__()
-        self.options = {"activation": activation, "width": width, "depth": depth, "exact_terminal": exact_terminal}
+        self.options = {
+            "activation": activation,
+            "activation_options": dict(activation_options),
+            "width": width,
+            "depth": depth,
+            "exact_terminal": exact_terminal,
+        }
         self.exact_terminal = exact_terminal
         self.seen_types: list[tuple[float, ...]] = []
         self.config_hash = ""
@@ -93,7 +102,9 @@ class ValueOperator(L.LightningModule, abc.ABC):
         self.has_roles = len(set(game.roles)) > 1
         self.register_buffer("roles", torch.tensor(game.roles), persistent=False)
         sensors = game.sensors((game.type_box.lo + game.type_box.hi) / 2).shape[-1]
-        self.net = DeepONet(1 + players * states + self.has_roles, sensors, activation, width, depth)
+        self.net = DeepONet(
+            1 + players * states + self.has_roles, sensors, activation, width, depth, activation_options
+        )
         self.value_error = WeightedMeanAbsolutePercentageError()
         self.costate_error = WeightedMeanAbsolutePercentageError()
         self.register_buffer("running", torch.zeros(len(self.terms)))

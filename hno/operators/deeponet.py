@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Mapping
+from types import MappingProxyType
 
 import torch
 from torch import Tensor, nn
@@ -16,12 +18,12 @@ class MLP(nn.Module):
 
     Args:
         sizes: input, hidden and output widths.
-        activation: registered name.
+        activation: of all hidden layers.
     """
 
-    def __init__(self, sizes: tuple[int, ...], activation: str) -> None:
+    def __init__(self, sizes: tuple[int, ...], activation: Activation) -> None:
         super().__init__()
-        self.activation: Activation = activations.get(activation)()
+        self.activation = activation
         layers = [nn.Linear(a, b) for a, b in itertools.pairwise(sizes)]
         for index, layer in enumerate(layers):
             self.activation.init_(layer, first=index == 0)
@@ -60,13 +62,22 @@ class DeepONet(nn.Module):
         activation: registered name, for both nets.
         width: hidden and output width.
         depth: hidden layers.
+        options: arguments of the activation.
     """
 
-    def __init__(self, trunk_inputs: int, sensors: int, activation: str, width: int = 64, depth: int = 4) -> None:
+    def __init__(
+        self,
+        trunk_inputs: int,
+        sensors: int,
+        activation: str,
+        width: int = 64,
+        depth: int = 4,
+        options: Mapping[str, float] = MappingProxyType({}),
+    ) -> None:
         super().__init__()
-        hidden = (width,) * (depth + 1)
-        self.trunk = MLP((trunk_inputs, *hidden), activation)
-        self.branch = MLP((sensors, *hidden), activation)
+        hidden, make = (width,) * (depth + 1), activations.get(activation)
+        self.trunk = MLP((trunk_inputs, *hidden), make(**options))
+        self.branch = MLP((sensors, *hidden), make(**options))
 
     def forward(self, y: Tensor, sensors: Tensor, which: Tensor) -> Tensor:
         """Value at each row.

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import copy
+import math
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -9,7 +11,8 @@ from torch import Tensor
 
 from hno.data import GameData
 from hno.data.curriculum import Curriculum
-from hno.data.datamodule import NoLabelsError, rows_of
+from hno.data.datamodule import BOX_TYPES, NoLabelsError, rows_of
+from hno.data.exchange import write_own
 from hno.games import make
 from hno.types import Batch, Status
 from tests.data.conftest import TYPES, MakeData
@@ -127,6 +130,49 @@ def test_held_out_trajectories_are_not_trained_on(make_data: MakeData) -> None:
     assert len(whole.points.tau) == len(TYPES) * len(data.extremals[0].t)
     assert torch.equal(whole.points.x[0], data.extremals[0].x[-1, 0].float())
     assert not any_equal_rows(whole.points.x, data.train_rows.points.x)
+
+
+@pytest.mark.parametrize("source", ["labelled", "box"])
+def test_every_stream_carries_its_types_as_a_table(make_data: MakeData, source: str) -> None:
+    """Nothing has to look for equal types later, and the branch runs once for each of them."""
+    data = make_data(interior_types=source)
+    samples = {f"{name} {step}": sample for step in (0, 7) for name, sample in data.batch(step).items()}
+    samples |= {f"large {name}": sample for name, sample in data.large_batch(7).items()}
+    (samples["validation"],) = data.val_dataloader()
+    assert len(samples) == 3 * 3 + 1
+    for name, (points, _, table) in samples.items():
+        assert table is not None, name
+        assert table.which.dtype == torch.int64
+        assert torch.equal(table.distinct[table.which], points.theta), name
+        assert len(table.distinct.unique(dim=0)) == len(table.distinct), name
+        of_box = source == "box" and ("interior" in name or "terminal" in name)
+        assert len(table.distinct) == (BOX_TYPES if of_box else len(TYPES)), name
+
+
+def test_own_labels_are_in_the_table(make_data: MakeData, tmp_path: Path) -> None:
+    game, path = make("narrow_road"), tmp_path / "mine.safetensors"
+    write_own(path, game, fake_labels(game, (2.5, 3.5), 4), "a test")
+    data = make_data(game, files=[path])
+    assert data.type_list == [*TYPES, (2.5, 3.5)]
+    for points, _, table in data.batch(5).values():
+        assert table is not None
+        assert [2.5, 3.5] in table.distinct.tolist()
+        assert torch.equal(table.distinct[table.which], points.theta)
+
+
+def test_large_batch_is_every_labelled_row_and_collocation_in_proportion(make_data: MakeData) -> None:
+    data = make_data()
+    size, before = data.train_rows.size, dict(data.batch_sizes)
+    assert size > 2 * 32
+    large, factor = data.large_batch(8), math.ceil(size / 32)
+    assert {name: sample.size for name, sample in large.items()} == {
+        "bvp": size, "interior": 64 * factor, "terminal": 16 * factor,
+    }  # fmt: skip
+    assert torch.equal(large["bvp"].points.x, data.train_rows.points.x)
+    assert data.batch_sizes == before
+    assert equal(large, data.large_batch(8))
+    full = make_data(batch_sizes={"bvp": None, "interior": None, "terminal": 5})
+    assert equal(full.large_batch(8), full.batch(8))
 
 
 def test_failed_trajectories_are_no_labels() -> None:

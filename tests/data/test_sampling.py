@@ -8,13 +8,14 @@ from torch import Tensor
 
 from hno.data.curriculum import Curriculum
 from hno.data.datamodule import BOX_TYPES
-from hno.data.sampling import check_shares, onto_band
+from hno.data.sampling import SOURCES, check_shares, onto_band
 from hno.games import Game, make
+from hno.types import Trajectory
 from tests.data.conftest import TYPES, MakeData
 
 GAMES = ("narrow_road", "lane_change", "drone")
 BASE = {"narrow_road": 1.25, "lane_change": 2.25, "drone": 0.5}
-ONLY = {name: {"box": 0.0, "band": 0.0, "labels": 0.0, name: 1.0} for name in ("box", "band", "labels")}
+ONLY = {name: dict.fromkeys(SOURCES, 0.0) | {name: 1.0} for name in SOURCES}
 
 
 def radius(game: str, theta: Tensor) -> Tensor:
@@ -89,7 +90,7 @@ def test_onto_band_reaches_its_target() -> None:
 
 
 @pytest.mark.parametrize("name", GAMES)
-@pytest.mark.parametrize("source", ["box", "band", "labels"])
+@pytest.mark.parametrize("source", SOURCES)
 def test_points_stay_in_the_state_box(make_data: MakeData, name: str, source: str) -> None:
     game = make(name)
     batch = make_data(game, shares=ONLY[source]).batch(5)
@@ -97,7 +98,7 @@ def test_points_stay_in_the_state_box(make_data: MakeData, name: str, source: st
         assert bool(game.state_box.contains(batch[stream].points.x).all())
 
 
-@pytest.mark.parametrize("source", ["box", "band", "labels"])
+@pytest.mark.parametrize("source", SOURCES)
 @pytest.mark.parametrize("step", [0, 3, 9, 50])
 def test_interior_times_stay_in_the_window_and_fill_it(make_data: MakeData, source: str, step: int) -> None:
     data = make_data(shares=ONLY[source], curriculum=Curriculum(0, 10))
@@ -142,5 +143,115 @@ def test_types_of_collocation_points(make_data: MakeData) -> None:
     [{"box": -0.1, "band": 1.0}, {"box": 0.0}, {"sphere": 1.0}, {"box": math.nan}, {"box": math.inf, "band": 1.0}, {}],
 )
 def test_impossible_shares_are_refused(shares: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match="box, band, labels"):
+    with pytest.raises(ValueError, match="box, band, labels, rollout"):
         check_shares(shares)
+
+
+@pytest.mark.parametrize("name", SOURCES)
+def test_every_source_can_stand_alone(name: str) -> None:
+    check_shares({name: 0.1})
+    check_shares(ONLY[name])
+
+
+def played(game: Game, seed: int = 0, episodes: int = 3, steps: int = 10) -> Trajectory:
+    """Episodes through random states; every one of them tells which time it belongs to."""
+    t = torch.linspace(0, game.horizon, steps + 1)
+    x = game.state_box.sample(episodes * len(t), torch.Generator().manual_seed(seed)).unflatten(0, (episodes, len(t)))
+    one = torch.ones(episodes)
+    return Trajectory(t, x, x[:, 1:, :, : game.control_dim], one.expand(2, -1).mT, one, one)
+
+
+def times_of(game: Game, episodes: Trajectory) -> Tensor:
+    return (game.horizon - episodes.t).expand(len(episodes.x), -1)
+
+
+@pytest.mark.parametrize("name", GAMES)
+def test_rollout_source_stays_near_visited_states_of_that_time(make_data: MakeData, name: str) -> None:
+    game = make(name)
+    data, episodes = make_data(game, shares=ONLY["rollout"]), played(game)
+    data.visit(episodes)
+    times = times_of(game, episodes)
+    points = data.batch(4)["interior"].points
+    assert len(points.tau.unique()) > 3
+    for tau, x in zip(points.tau, points.x, strict=True):
+        states = episodes.x[times == tau]
+        assert len(states) == 3
+        assert float(((states - x) / game.state_box.width).abs().amax((-2, -1)).min()) < 0.05 * 5
+    spread = ((points.x[:, None] - episodes.x.flatten(0, 1)) / game.state_box.width).abs().amax((-2, -1)).amin(-1)
+    assert float(spread.median()) > 0.01, "points lie around visited states, not on them"
+
+
+def test_only_the_latest_episodes_are_drawn_from(make_data: MakeData) -> None:
+    data = make_data(shares=ONLY["rollout"])
+    game, seen = data.game, []
+    for seed in (0, 1):
+        episodes = played(game, seed)
+        data.visit(episodes)
+        assert data.visited is not None
+        assert torch.equal(data.visited[0], times_of(game, episodes).flatten())
+        assert torch.equal(data.visited[1], episodes.x.flatten(0, 1))
+        seen.append(data.batch(4)["interior"].points.x)
+    assert not torch.equal(*seen)
+
+
+def test_before_any_validation_the_policy_is_where_the_labels_are(make_data: MakeData) -> None:
+    data = make_data(shares=ONLY["rollout"])
+    assert data.visited is None
+    points, rows, width = data.batch(4)["interior"].points, data.train_rows.points, data.game.state_box.width
+    for tau, x in zip(points.tau, points.x, strict=True):
+        states = rows.x[rows.tau == tau]
+        assert len(states)
+        assert float(((states - x) / width).abs().amax((-2, -1)).min()) < 0.05 * 5
+
+
+def test_visits_touch_nothing_but_their_own_share(make_data: MakeData) -> None:
+    shares = dict.fromkeys(SOURCES, 1.0)
+    before, after = make_data(shares=shares), make_data(shares=shares)
+    after.visit(played(after.game))
+    old, new = before.batch(8), after.batch(8)
+    assert torch.equal(old["bvp"].points.x, new["bvp"].points.x)
+    same = (old["interior"].points.x == new["interior"].points.x).flatten(1).all(-1)
+    assert 0.5 < float(same.float().mean()) < 1
+    assert torch.equal(old["interior"].points.theta, new["interior"].points.theta)
+
+
+def test_states_that_are_not_finite_are_not_visited(make_data: MakeData) -> None:
+    data = make_data(shares=ONLY["rollout"])
+    episodes = played(data.game)
+    x = episodes.x.clone()
+    x[0, 4:], x[1, 7:, 1, 2] = torch.nan, torch.inf
+    data.visit(episodes._replace(x=x))
+    assert data.visited is not None
+    times, states = data.visited
+    assert len(times) == len(states) == 33 - 7 - 4
+    assert bool(states.isfinite().all())
+    for tau, state in zip(times, states, strict=True):
+        assert bool((state == episodes.x[times_of(data.game, episodes) == tau]).flatten(1).all(-1).any())
+    data.visit(episodes._replace(x=torch.full_like(x, torch.nan)))
+    assert torch.equal(data.visited[1], states), "an episode without a finite state leaves the older ones"
+
+
+@pytest.mark.parametrize("step", [0, 3])
+@pytest.mark.xfail(raises=RuntimeError, reason="the pool has no state inside the window, and randint(0) raises")
+def test_a_policy_that_breaks_at_its_start_leaves_points_to_draw(make_data: MakeData, step: int) -> None:
+    """Controls that are not finite: of every episode, only the start is, which the window does not reach yet."""
+    data = make_data(shares=ONLY["rollout"], curriculum=Curriculum(0, 10))
+    episodes = played(data.game)
+    x = episodes.x.clone()
+    x[:, 1:] = torch.nan
+    data.visit(episodes._replace(x=x))
+    points = data.batch(step)["interior"].points
+    assert bool(points.x.isfinite().all())
+    assert float(points.tau.max()) <= (step + 1) / 10 * data.game.horizon * (1 + 1e-6)
+
+
+def test_visits_survive_a_checkpoint(make_data: MakeData) -> None:
+    data, resumed, fresh = (make_data(shares=ONLY["rollout"]) for _ in range(3))
+    assert data.state_dict() == {}
+    data.visit(played(data.game))
+    resumed.load_state_dict(data.state_dict())
+    fresh.load_state_dict({})
+    for batch in (resumed.batch(6), resumed.batch(6)):
+        assert torch.equal(batch["interior"].points.x, data.batch(6)["interior"].points.x)
+    assert fresh.visited is None
+    assert not torch.equal(fresh.batch(6)["interior"].points.x, data.batch(6)["interior"].points.x)

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from hno.cli.summary import percent, show, verdict
 from hno.evaluation.closed_loop import TypeRow, classify, collision_table
+from hno.evaluation.rollout import Disturbance
 from hno.types import Extremal, Status
 from tests.fakes import fake_labels
 from tests.walkers import Walkers
@@ -82,6 +83,32 @@ def test_a_broken_policy_collides_everywhere() -> None:
     nothing = torch.full((2, 2), torch.nan)
     (row,) = collision_table(Walkers(), lambda tau, x, theta: nothing.expand(len(x), 2, 2), [found], seen=[])
     assert (row.collisions, row.marginal_collisions, row.rate) == (1, 1, 1.0)
+
+
+def test_a_disturbance_reaches_the_episodes() -> None:
+    """Walkers who step aside at once pass each other; who do so half a second late have collided by then."""
+    found = labelled([0.0, 0.9], [0.5, 0.5])
+
+    def aside(tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
+        """Aside for the first 0.2 s, after the first answer of all."""
+        speed = torch.where((tau > 0.79) & (tau < 0.99), 3.0, 0.0)
+        return torch.stack([torch.full_like(tau, 4.0), speed], -1).unsqueeze(1).expand(-1, 2, -1)
+
+    def collisions(disturbance: Disturbance) -> int:
+        (row,) = collision_table(Walkers(), aside, [found], [], disturbance=disturbance)
+        assert row.safe_starts == 2
+        return row.collisions
+
+    assert collisions(Disturbance()) == 0
+    assert collisions(Disturbance(delay=25)) == 1
+
+    def distance(disturbance: Disturbance) -> float | None:
+        return collision_table(Walkers(), aside, [found], [], disturbance=disturbance)[0].median_min_distance
+
+    assert distance(Disturbance(0.0, 0, 5)) == distance(Disturbance())
+    noisy = [distance(Disturbance(0.05, 0, seed)) for seed in (1, 1, 2)]
+    assert noisy[0] == noisy[1]
+    assert len({*noisy, distance(Disturbance())}) == 3
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from hno.evaluation.rollout import rollout
+from hno.evaluation.rollout import Disturbance, Policy, rollout
 from hno.games import Game, make
 from hno.types import Extremal, Trajectory
 from tests.walkers import Walkers
@@ -154,3 +154,120 @@ def test_dt_must_divide_the_horizon(dt: float) -> None:
     game = Walkers()
     with pytest.raises(ValueError, match="divides the horizon of 1 s"):
         rollout(game, steady(game, torch.zeros(2, 2)), torch.zeros(1, 2, 2), torch.ones(1, 2), dt)
+
+
+def feedback(game: Game) -> Policy:
+    """A policy that depends on everything it is told, within the control box."""
+
+    def policy(tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
+        lean = torch.sin(3 * x.sum(-1) + 5 * tau.unsqueeze(-1) + theta).unsqueeze(-1)
+        box = game.control_box
+        return (box.lo + box.hi) / 2 + box.width / 2 * lean * torch.linspace(0.3, 1, game.control_dim, dtype=x.dtype)
+
+    return policy
+
+
+def episodes(name: str, disturbance: Disturbance, policy: Policy | None = None, count: int = 3) -> Trajectory:
+    game = make(name).double()
+    generator = torch.Generator().manual_seed(4)
+    x0, theta = game.initial_box.sample(count, generator), game.type_box.sample(count, generator)
+    return rollout(game, policy or feedback(game), x0, theta, dt=0.1, disturbance=disturbance)
+
+
+@pytest.mark.parametrize("name", GAMES)
+@pytest.mark.parametrize("disturbance", [Disturbance(), Disturbance(0.0, 0, 7)])
+def test_no_disturbance_changes_nothing(name: str, disturbance: Disturbance) -> None:
+    game = make(name).double()
+    generator = torch.Generator().manual_seed(4)
+    x0, theta = game.initial_box.sample(3, generator), game.type_box.sample(3, generator)
+    assert all(map(torch.equal, episodes(name, disturbance), rollout(game, feedback(game), x0, theta, dt=0.1)))
+
+
+@pytest.mark.parametrize("delay", [1, 3, 29, 30, 100])
+def test_a_delay_applies_older_answers(delay: int) -> None:
+    """Until the first answer comes it is applied in advance; what is asked is the state of now."""
+    game, answers, states = make("narrow_road").double(), list[Tensor](), list[Tensor]()
+
+    def policy(tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
+        states.append(x.clone())
+        answers.append(feedback(game)(tau, x, theta))
+        return answers[-1].clone()
+
+    played = episodes("narrow_road", Disturbance(delay=delay), policy)
+    assert len(answers) == 30
+    for k in range(30):
+        assert torch.equal(played.u[:, k], answers[max(0, k - delay)])
+        assert torch.equal(states[k], played.x[:, k])
+    undisturbed = episodes("narrow_road", Disturbance())
+    assert torch.equal(played.u[:, :1], undisturbed.u[:, :1])
+    assert not torch.equal(played.u[:, 1:], undisturbed.u[:, 1:])
+
+
+def test_a_delay_shifts_what_depends_on_time_alone() -> None:
+    game = make("drone").double()
+
+    def clock(tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
+        box = game.control_box
+        return (box.lo + box.width * (tau / game.horizon).unsqueeze(-1)).unsqueeze(1).expand(-1, 2, -1)
+
+    now, late = (episodes("drone", Disturbance(delay=delay), clock).u for delay in (0, 4))
+    assert torch.equal(late[:, 4:], now[:, :-4])
+    assert torch.equal(late[:, :4], now[:, :1].expand(-1, 4, -1, -1))
+
+
+@pytest.mark.parametrize("name", GAMES)
+@pytest.mark.parametrize("noise", [0.05, 10.0])
+def test_noise_stays_admissible(name: str, noise: float) -> None:
+    box = make(name).double().control_box
+    u = episodes(name, Disturbance(noise)).u
+    assert bool(((box.lo <= u) & (u <= box.hi)).all())
+    outside = episodes(name, Disturbance(noise), lambda tau, x, theta: box.hi.expand(len(x), 2, -1)).u
+    assert bool((outside <= box.hi).all())
+    assert bool((outside < box.hi).any())
+
+
+def test_noise_is_new_for_every_step_player_control_and_row() -> None:
+    game = make("drone").double()
+    middle = (game.control_box.lo + game.control_box.hi) / 2
+    u = episodes("drone", Disturbance(0.01), steady(game, middle.expand(2, -1)), count=200).u
+    noise = (u - middle) / (game.control_box.width / 2)
+    assert len(noise.flatten().unique()) == noise.numel()
+    assert noise.mean().item() == pytest.approx(0, abs=2e-4)
+    torch.testing.assert_close(noise.std(dim=(0, 1, 2)), torch.full((3,), 0.01, dtype=torch.float64), rtol=0.03, atol=0)
+    assert torch.corrcoef(torch.stack([noise[:, :-1].flatten(), noise[:, 1:].flatten()]))[0, 1].abs() < 0.02
+    assert torch.corrcoef(torch.stack([noise[:, :, 0].flatten(), noise[:, :, 1].flatten()]))[0, 1].abs() < 0.02
+
+
+def test_noise_is_a_function_of_its_seed() -> None:
+    torch.manual_seed(1)
+    first = episodes("lane_change", Disturbance(0.1, 1, seed=3))
+    state = torch.random.get_rng_state()
+    torch.manual_seed(2)
+    again, other = (episodes("lane_change", Disturbance(0.1, 1, seed=seed)) for seed in (3, 4))
+    assert all(map(torch.equal, first, again))
+    assert not torch.equal(first.u[:, 0], other.u[:, 0])
+    torch.manual_seed(1)
+    assert torch.equal(torch.random.get_rng_state(), state), "the global generator is left alone"
+
+
+def test_delay_and_noise_together_disturb_the_older_answer() -> None:
+    game = Walkers().double()
+    steps = iter(range(100))
+
+    def counting(tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
+        return torch.full((len(x), 2, 2), 0.1 * next(steps), dtype=torch.float64)
+
+    x0, theta = torch.zeros(50, 2, 2, dtype=torch.float64), torch.ones(50, 2, dtype=torch.float64)
+    played = rollout(game, counting, x0, theta, 0.05, disturbance=Disturbance(1e-3, 2))
+    wanted = 0.1 * torch.tensor([max(0, k - 2) for k in range(20)], dtype=torch.float64)
+    error = played.u - wanted[:, None, None]
+    assert error.abs().max().item() < 6e-3 * 5
+    assert error.std().item() == pytest.approx(6e-3, rel=0.1)
+
+
+def test_a_broken_policy_is_not_safe_under_noise() -> None:
+    game = Walkers()
+    x0 = torch.zeros(1, 2, 2)
+    broken = steady(game, torch.full((2, 2), torch.nan))
+    played = rollout(game, broken, x0, torch.ones(1, 2), disturbance=Disturbance(0.1, 1))
+    assert not bool(played.clearance > 0)

@@ -62,7 +62,7 @@ def test_sin_weights_are_uniform_within_the_siren_bounds(layer: nn.Linear, first
 
 def test_sin_keeps_the_size_of_phases_through_the_layers() -> None:
     torch.manual_seed(0)
-    net, phases = MLP((16, 256, 256, 256, 256), "sin"), []
+    net, phases = MLP((16, 256, 256, 256, 256), activations.get("sin")()), []
     for layer in net.layers[1:]:
         layer.register_forward_hook(lambda module, arguments, output: phases.append(30 * output))
     net(2 * torch.rand(500, 16) - 1)
@@ -72,7 +72,7 @@ def test_sin_keeps_the_size_of_phases_through_the_layers() -> None:
 @pytest.mark.parametrize("name", ACTIVATIONS)
 def test_relu_and_tanh_signals_neither_vanish_nor_explode(name: str) -> None:
     torch.manual_seed(0)
-    output = MLP((16, 64, 64, 64, 64, 64), name)(2 * torch.rand(500, 16) - 1)
+    output = MLP((16, 64, 64, 64, 64, 64), activations.get(name)())(2 * torch.rand(500, 16) - 1)
     assert 0.02 < output.std().item() < 5
 
 

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -8,8 +9,10 @@ import torch
 from torch import Tensor
 
 from hno.games import make
+from hno.losses import Scales, hji_residual
 from hno.operators import ValueOperator, operators
-from hno.operators.optimizers import make_optimizer
+from hno.operators.base import distinct_types
+from hno.operators.optimizers import OPTIMIZERS, SCHEDULES, make_optimizer, muon
 from hno.registry import UnknownNameError
 from hno.types import Batch, Labels, Points, Sample
 from tests.operators.conftest import ACTIVATIONS, MakeOperator, random_points
@@ -150,7 +153,13 @@ def test_training_needs_an_optimizer(make_operator: MakeOperator) -> None:
 
 @pytest.mark.parametrize(
     ("changes", "near"),
-    [({"name": "adamm"}, "'adam'"), ({"name": "saop"}, "'soap'"), ({"schedule": "cosin"}, "'cosine'")],
+    [
+        ({"name": "adamm"}, "'adam'"),
+        ({"name": "saop"}, "'soap'"),
+        ({"name": "moun"}, "'muon'"),
+        ({"schedule": "cosin"}, "'cosine'"),
+        ({"schedule": "liner"}, "'linear'"),
+    ],
 )
 def test_unknown_optimizer_or_schedule_lists_the_known_ones(changes: dict[str, Any], near: str) -> None:
     arguments = {"name": "adam", "steps": 10, "lr": 1e-3, "schedule": "constant", "final_lr": 0.0}
@@ -182,7 +191,87 @@ def test_cosine_rate_falls_from_the_first_to_the_last_step() -> None:
     assert sorted(seen, reverse=True) == seen
 
 
-@pytest.mark.parametrize("name", ["adam", "adamw", "soap"])
+def test_linear_rate_falls_by_the_same_amount_every_step() -> None:
+    assert rates("linear") == pytest.approx([1e-2 + (1e-4 - 1e-2) * step / 10 for step in range(11)])
+
+
+@pytest.mark.parametrize("schedule", ["cosine", "linear"])
+def test_a_rate_that_has_fallen_stays(schedule: str) -> None:
+    weight = torch.nn.Parameter(torch.zeros(1))
+    built = make_optimizer("adam", 4, lr=1e-2, schedule=schedule, final_lr=1e-4)([weight])
+    for _ in range(9):
+        built["optimizer"].step()
+        built["lr_scheduler"]["scheduler"].step()
+    assert built["optimizer"].param_groups[0]["lr"] == pytest.approx(1e-4)
+    assert built["lr_scheduler"]["interval"] == "step"
+
+
+@pytest.mark.parametrize("schedule", SCHEDULES)
+@pytest.mark.parametrize("name", sorted(OPTIMIZERS))
+def test_a_schedule_scales_the_rate_of_every_group(make_operator: MakeOperator, name: str, schedule: str) -> None:
+    parameters = list(make_operator().net.parameters())
+    built = make_optimizer(name, 10, lr=1e-2, schedule=schedule, final_lr=1e-3)(parameters)
+    optimizer, first = built["optimizer"], [group["lr"] for group in built["optimizer"].param_groups]
+    assert sum(len(group["params"]) for group in optimizer.param_groups) == len(parameters)
+    shares = {"constant": (1.0, 1.0), "cosine": (0.55, 0.1), "linear": (0.55, 0.1)}[schedule]
+    for share in shares:
+        for _ in range(5):
+            optimizer.step()
+            if "lr_scheduler" in built:
+                built["lr_scheduler"]["scheduler"].step()
+        assert [group["lr"] for group in optimizer.param_groups] == pytest.approx([share * lr for lr in first])
+
+
+def test_the_rate_that_a_schedule_scales_is_the_one_that_is_applied(make_operator: MakeOperator) -> None:
+    """Muon has rates of two kinds; at rate 0 nothing may move, whatever its kind."""
+    operator = make_operator()
+    built = make_optimizer("muon", 1, lr=2e-2, schedule="linear", final_lr=0.0)(operator.net.parameters())
+    batch = random_batch(operator)
+    moved = []
+    for step in range(2):
+        before = [weights.detach().clone() for weights in operator.net.parameters()]
+        built["optimizer"].zero_grad()
+        operator.training_step(batch, step).backward()
+        built["optimizer"].step()
+        built["lr_scheduler"]["scheduler"].step()
+        moved.append([not torch.equal(w, old) for w, old in zip(operator.net.parameters(), before, strict=True)])
+    assert all(moved[0])
+    assert not any(moved[1])
+
+
+def test_muon_is_for_matrices_and_adamw_for_everything_else(make_operator: MakeOperator) -> None:
+    net = make_operator().net
+    optimizer = muon(net.parameters(), lr=2e-2, adamw_lr=5e-3)
+    groups = {group["use_muon"]: group for group in optimizer.param_groups}
+    assert {id(weights) for weights in groups[True]["params"]} == {id(w) for w in net.parameters() if w.dim() == 2}
+    assert {id(weights) for weights in groups[False]["params"]} == {id(w) for w in net.parameters() if w.dim() < 2}
+    assert any(w is net.trunk.activation.slope for w in groups[False]["params"])
+    assert (groups[True]["lr"], groups[False]["lr"]) == (2e-2, 5e-3)
+
+
+def test_muon_moves_matrices_by_an_orthogonal_step_and_others_by_their_own_rate() -> None:
+    """Newton-Schulz brings all singular values near 1, whatever the gradient's; Adam's first step is its rate."""
+    torch.manual_seed(0)
+    matrix, vector = torch.nn.Parameter(torch.zeros(6, 4)), torch.nn.Parameter(torch.zeros(5))
+    matrix.grad = torch.linalg.qr(torch.randn(6, 6))[0][:, :4] * torch.tensor([100.0, 10.0, 3.0, 1.0])
+    vector.grad = torch.tensor([1e3, -1.0, 1e-2, 4.0, -7.0])
+    sign = vector.grad.sign()
+    muon([matrix, vector], lr=2e-2, adamw_lr=5e-3).step()
+    sizes = torch.linalg.svdvals(matrix.detach())
+    assert float(sizes.max() / sizes.min()) < 2.5
+    torch.testing.assert_close(vector.detach(), -5e-3 * sign, rtol=1e-4, atol=0)
+
+
+def test_muon_decays_matrices_alone() -> None:
+    matrix, vector = torch.nn.Parameter(torch.ones(4, 4)), torch.nn.Parameter(torch.ones(4))
+    optimizer = muon([matrix, vector], lr=1e-2, weight_decay=0.5)
+    matrix.grad, vector.grad = torch.zeros(4, 4), torch.zeros(4)
+    optimizer.step()
+    torch.testing.assert_close(matrix.detach(), torch.full((4, 4), 1 - 0.5 * 1e-2))
+    assert torch.equal(vector.detach(), torch.ones(4))
+
+
+@pytest.mark.parametrize("name", sorted(OPTIMIZERS))
 def test_every_optimizer_lowers_a_loss(make_operator: MakeOperator, name: str) -> None:
     operator = make_operator(name="sno")
     batch = random_batch(operator, 32)
@@ -202,7 +291,169 @@ def test_norms_are_refused_by_name() -> None:
         operators.get("hno")(make("drone"), norm="l3")
 
 
-@pytest.mark.parametrize("name", ["adam", "adamw", "soap"])
+@pytest.mark.parametrize("name", sorted(OPTIMIZERS))
 def test_unknown_optimizer_options_are_refused_before_training(name: str) -> None:
     with pytest.raises(KeyError, match="No option of"):
         make_optimizer(name, steps=3, lr=1e-3, schedule="constant", final_lr=0.0, foo=1)
+
+
+@pytest.mark.parametrize(
+    ("option", "near"), [("adam_lr", "adamw_lr"), ("momentun", "momentum"), ("weight_deca", "weight_decay")]
+)
+def test_options_of_muon_come_with_the_nearest(option: str, near: str) -> None:
+    with pytest.raises(UnknownNameError, match=f"Did you mean '{near}'"):
+        make_optimizer("muon", steps=3, lr=1e-3, schedule="constant", final_lr=0.0, **{option: 0.1})
+
+
+@pytest.fixture
+def logged(monkeypatch: pytest.MonkeyPatch) -> dict[str, float]:
+    """What the latest training step logged."""
+    content: dict[str, float] = {}
+    monkeypatch.setattr(ValueOperator, "log", lambda self, name, value, **kwargs: content.update({name: float(value)}))
+    monkeypatch.setattr(
+        ValueOperator,
+        "log_dict",
+        lambda self, values, **kwargs: content.update({n: float(v) for n, v in values.items()}),
+    )
+    return content
+
+
+def test_balanced_terms_begin_at_their_weights(make_operator: MakeOperator) -> None:
+    """The first running mean of a term is the term itself."""
+    batch = random_batch(make_operator())
+    operator = make_operator(weights=ALL, balance=True)
+    assert operator.training_step(batch, 0).item() == pytest.approx(sum(ALL.values()))
+    assert make_operator(name="sno", balance=True).training_step(batch, 0).item() == pytest.approx(2)
+    late = make_operator(weights=ALL, balance=True)
+    assert late.training_step({"bvp": batch["bvp"]}, 0).item() == pytest.approx(2)
+    first = late.training_step(batch, 1).item()
+    assert first == pytest.approx(2 + 0.1 + 0.1), "terms that join later begin at their weights too"
+
+
+def test_a_balanced_term_is_divided_by_its_running_mean(make_operator: MakeOperator, logged: dict[str, float]) -> None:
+    operator = make_operator(weights=ALL, balance=True)
+    batches = [random_batch(operator, 8) for _ in range(4)]
+    mean: dict[str, float] = {}
+    for step, batch in enumerate(batches):
+        total = operator.training_step(batch, step).item()
+        now = {name: logged[f"loss/{name}"] for name in ALL}
+        mean = {name: 0.99 * mean.get(name, now[name]) + 0.01 * now[name] for name in ALL}
+        assert total == pytest.approx(sum(ALL[name] * now[name] / mean[name] for name in ALL), rel=1e-5)
+        assert logged["loss/total"] == pytest.approx(total)
+
+
+def test_a_balanced_loss_has_the_gradient_of_the_log_loss(make_operator: MakeOperator) -> None:
+    operator, plain = make_operator(weights=ALL, balance=True), make_operator(weights=ALL)
+    batch = random_batch(operator)
+    slopes = torch.autograd.grad(operator.training_step(batch, 0), list(operator.net.parameters()))
+    logs = [ALL[name] * loss.log() for name, loss in plain.loss_terms(batch).items()]
+    expected = torch.autograd.grad(torch.stack(logs).sum(), list(plain.net.parameters()))
+    for found, slope in zip(slopes, expected, strict=True):
+        torch.testing.assert_close(found, slope, rtol=1e-3, atol=1e-6)
+
+
+def test_a_balanced_loss_does_not_depend_on_the_unit_of_a_term(make_operator: MakeOperator) -> None:
+    totals = []
+    for scaled in (True, False):
+        operator = make_operator(name="sno", balance=True, scaled=scaled)
+        operator.set_scales(Scales(torch.tensor(40.0), torch.full_like(operator.costate_scale, 3.0)))
+        torch.manual_seed(0)
+        totals.append([operator.training_step(random_batch(operator), step).item() for step in range(3)])
+    assert totals[0] == pytest.approx(totals[1], rel=1e-4)
+
+
+def test_a_balanced_term_that_vanishes_leaves_the_loss_finite(make_operator: MakeOperator) -> None:
+    operator = make_operator(weights=ALL, balance=True, exact_terminal=True)
+    batch = random_batch(operator)
+    for step in range(2):
+        loss = operator.training_step(batch, step)
+        loss.backward()
+        assert loss.item() == pytest.approx(2.1, rel=0.2)
+    assert all(bool(w.grad.isfinite().all()) for w in operator.net.parameters() if w.grad is not None)
+
+
+def test_running_means_survive_a_checkpoint(make_operator: MakeOperator) -> None:
+    whole = make_operator(weights=ALL, balance=True)
+    batches = [random_batch(whole) for _ in range(3)]
+    for step in range(2):
+        whole.training_step(batches[step], step)
+    resumed = make_operator(weights=ALL, balance=True, seed=1)
+    resumed.load_state_dict(whole.state_dict())
+    assert bool((resumed.running > 0).all())
+    fresh = make_operator(weights=ALL, balance=True)
+    fresh.net.load_state_dict(whole.net.state_dict())
+    totals = [operator.training_step(batches[2], 2).item() for operator in (whole, resumed, fresh)]
+    assert totals[0] == totals[1]
+    assert totals[0] != totals[2]
+
+
+def test_means_run_only_where_they_are_asked_for(make_operator: MakeOperator) -> None:
+    operator = make_operator(weights=ALL)
+    operator.training_step(random_batch(operator), 0)
+    assert not operator.running.any()
+
+
+def residuals(operator: ValueOperator, batch: Batch) -> Tensor:
+    """Largest residual over the players of every collocation point, in the unit of the loss."""
+    points, game = batch["interior"].points, operator.game
+    size = operator.value_scale / game.horizon + game.penalty(game.constraint(points.x, points.theta))
+    with torch.no_grad():
+        found = hji_residual(game, points, operator.field(points))
+    return (found / size if operator.scaled else found).abs().amax(-1)
+
+
+@pytest.mark.parametrize("scaled", [True, False])
+@pytest.mark.parametrize(("share", "count"), [(0.25, 3), (0.5, 6), (0.05, 1), (0.01, 1), (0.999, 12)])
+@pytest.mark.parametrize("table", [True, False])
+def test_only_the_hardest_points_count(
+    make_operator: MakeOperator, scaled: bool, share: float, count: int, table: bool
+) -> None:
+    options = {"weights": {"value": 1.0, "residual": 0.5}, "scaled": scaled}
+    operator = make_operator(hardest=share, **options).double()
+    batch = random_batch(operator, 12)
+    if table:
+        batch = {name: s._replace(types=distinct_types(s.points.theta)) for name, s in batch.items()}
+    sizes = residuals(operator, batch)
+    hardest = sizes.argsort(descending=True)[:count]
+    expected = make_operator(**options).double().loss_terms(batch | {"interior": batch["interior"].rows(hardest)})
+    found = operator.loss_terms(batch)
+    torch.testing.assert_close(found["residual"], expected["residual"], rtol=1e-12, atol=0)
+    torch.testing.assert_close(found["value"], expected["value"], rtol=1e-12, atol=0)
+    assert len(sizes.unique()) == 12
+    easier = sizes.argsort(descending=True)[1 : count + 1]
+    other = make_operator(**options).double().loss_terms(batch | {"interior": batch["interior"].rows(easier)})
+    assert (found["residual"] - other["residual"]).abs() > 1e-9 or count == 12
+
+
+def test_all_points_count_where_none_is_left_out(make_operator: MakeOperator, monkeypatch: pytest.MonkeyPatch) -> None:
+    batch = random_batch(make_operator())
+    every = make_operator(weights=ALL).training_step(batch, 0)
+    operator = make_operator(weights=ALL, hardest=1.0)
+
+    def never(*arguments: object) -> None:
+        raise AssertionError("rows were picked")
+
+    monkeypatch.setattr(Sample, "rows", never)
+    assert torch.equal(operator.training_step(batch, 0), every)
+
+
+def test_the_hardest_points_have_a_gradient(make_operator: MakeOperator) -> None:
+    operator = make_operator(weights={"residual": 1.0}, hardest=0.25)
+    operator.training_step(random_batch(operator), 0).backward()
+    assert bool(operator.net.trunk.layers[0].weight.grad.any())
+
+
+def test_only_collocation_points_are_left_out(make_operator: MakeOperator) -> None:
+    batch = random_batch(make_operator())
+    terms = {share: make_operator(weights=ALL, hardest=share).loss_terms(batch) for share in (1.0, 0.2)}
+    for name in ("value", "costate", "boundary"):
+        assert torch.equal(terms[1.0][name], terms[0.2][name])
+    assert not torch.equal(terms[1.0]["residual"], terms[0.2]["residual"])
+    sno = {share: make_operator(name="sno", hardest=share).training_step(batch, 0) for share in (1.0, 0.2)}
+    assert torch.equal(*sno.values())
+
+
+@pytest.mark.parametrize("share", [0, 0.0, -0.5, 1.0001, 2, math.nan, math.inf])
+def test_impossible_shares_of_points_are_refused(make_operator: MakeOperator, share: float) -> None:
+    with pytest.raises(ValueError, match=r"loss.hardest is a share in \(0, 1\]"):
+        make_operator(hardest=share)

@@ -1,0 +1,420 @@
+"""Closed-loop validation while a model trains, on policies whose episodes are known."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from hno.data import GameData
+from hno.data.curriculum import Curriculum
+from hno.evaluation import validation as module
+from hno.evaluation.closed_loop import collision_table
+from hno.evaluation.rollout import rollout
+from hno.evaluation.validation import BEST, ClosedLoopValidation, Score, score, starts_of
+from hno.games import Game, make
+from hno.operators import ValueOperator, operators
+from hno.operators.checkpoint import OperatorPolicy
+from hno.types import Extremal, Field, Points, Trajectory, join
+from tests.fakes import fake_labels
+from tests.walkers import Walkers
+
+GAMES = ("narrow_road", "lane_change", "drone")
+SAFE, CLOSE = 0.9, 0.05
+"""Heights of starts: straight walkers of one height pass each other by twice that; their radii add up to 0.4 m."""
+
+
+class Trainer:
+    """As much of a trainer as a validation needs; a checkpoint holds the step."""
+
+    def __init__(self, max_steps: int = 100, datamodule: object = None) -> None:
+        self.global_step, self.max_steps, self.should_stop = 0, max_steps, False
+        self.datamodule = datamodule
+
+    def save_checkpoint(self, path: Path, weights_only: bool) -> None:
+        assert not weights_only, "a checkpoint to resume from holds the optimiser too"
+        Path(path).write_text(str(self.global_step))
+
+
+def straight(x: Tensor) -> Tensor:
+    """4 m/s along x."""
+    return torch.tensor([4.0, 0.0]).to(x).expand_as(x)
+
+
+def away(x: Tensor) -> Tensor:
+    """Backwards: nobody meets, and nobody arrives."""
+    return -straight(x)
+
+
+def nowhere(x: Tensor) -> Tensor:
+    return torch.full_like(x, torch.nan)
+
+
+Play = Callable[[Tensor], Tensor]
+
+
+@pytest.fixture
+def walking(monkeypatch: pytest.MonkeyPatch) -> Callable[[Play], ValueOperator]:
+    """An operator of the walkers' game whose policy is known: the costate of a velocity u is 2 u."""
+    monkeypatch.setattr(ValueOperator, "log_dict", lambda self, values, **kwargs: None)
+
+    def build(play: Play) -> ValueOperator:
+        operator = operators.get("hno")(Walkers(), width=8, depth=1)
+
+        def field(points: Points, types: object = None) -> Field:
+            costate = torch.zeros(len(points.x), 2, 2, 2)
+            for i in range(2):
+                costate[:, i, i] = 2 * play(points.x)[:, i]
+            return Field(points.theta, points.theta, costate)
+
+        monkeypatch.setattr(operator, "field", field)
+        return operator
+
+    return build
+
+
+def labelled(heights: Sequence[float], theta: float = 1.0, excess: float | None = None) -> Extremal:
+    """Labels from starts of these heights.
+
+    Args:
+        heights: of each start.
+        theta: of both players.
+        excess: choose values so that straight walkers cost so much more, relative to the label.
+    """
+    start = torch.tensor([[[0.0, y], [0.0, y]] for y in heights])
+    found = fake_labels(Walkers(), (theta, theta), len(heights), start=start)
+    if excess is None:
+        return found
+    played = rollout(Walkers(), lambda tau, x, types: straight(x), start, found.theta.float())
+    value = found.value.clone()
+    value[:, 0] = played.value / (1 + excess)
+    return found._replace(value=value)
+
+
+@pytest.fixture
+def rest(tmp_path: Path) -> Callable[..., ClosedLoopValidation]:
+    """A validation every 10 steps."""
+
+    def build(**options: Any) -> ClosedLoopValidation:
+        return ClosedLoopValidation(**({"folder": tmp_path, "every": 10} | options))
+
+    return build
+
+
+Build = Callable[..., ClosedLoopValidation]
+Walking = Callable[[Play], ValueOperator]
+
+
+@pytest.mark.parametrize(("safe", "close"), [(4, 0), (3, 1), (1, 3), (0, 4)])
+def test_score_is_the_share_of_collisions(rest: Build, walking: Walking, safe: int, close: int) -> None:
+    callback = rest()
+    callback.begin([labelled([SAFE] * safe + [CLOSE] * close)])
+    found = callback.consider(Trainer(), walking(straight))
+    assert found is not None
+    assert found.collision_rate == close / 4
+
+
+@pytest.mark.parametrize("excess", [0.0, 0.25, -0.2, 3.0])
+def test_excess_is_relative_to_the_cost_of_the_equilibria(rest: Build, walking: Walking, excess: float) -> None:
+    callback = rest()
+    callback.begin([labelled([0.5, 0.6, 0.9], excess=excess), labelled([0.7, 0.8], theta=2.0, excess=excess)])
+    found = callback.consider(Trainer(), walking(straight))
+    assert found is not None
+    assert found.excess == pytest.approx(excess, abs=1e-4)
+
+
+def test_score_looks_at_the_types_of_each_start(rest: Build, walking: Walking) -> None:
+    """Walkers who miss each other by 0.6 m; the radius is 0.2 + 0.2 theta."""
+    callback = rest()
+    callback.begin([labelled([0.3], theta=theta) for theta in (1.0, 4.0, 1.5, 3.0)])
+    found = callback.consider(Trainer(), walking(straight))
+    assert found is not None
+    assert found.collision_rate == 0.5
+
+
+def test_safety_comes_first_then_cost() -> None:
+    order = [Score(0.0, -0.1), Score(0.0, 0.2), Score(0.0, math.inf), Score(0.1, -5.0), Score(1.0, -9.0)]
+    assert sorted(reversed(order)) == order
+
+
+def test_one_broken_episode_collides_and_does_not_spoil_the_median() -> None:
+    starts = starts_of([labelled([SAFE] * 5, excess=0.5)])
+    played = rollout(Walkers(), lambda tau, x, theta: straight(x), starts.x0, starts.theta)
+    value, clearance = played.value.clone(), played.clearance.clone()
+    value[2], clearance[2] = torch.nan, torch.nan
+    found = score(played._replace(value=value, clearance=clearance), starts)
+    assert found.collision_rate == pytest.approx(0.2)
+    assert found.excess == pytest.approx(0.5, abs=1e-3)
+    touching = clearance.nan_to_num(1.0)
+    touching[4] = 0.0
+    assert score(played._replace(clearance=touching), starts).collision_rate == pytest.approx(0.2)
+
+
+def test_a_policy_that_is_not_a_number_collides(rest: Build, walking: Walking) -> None:
+    callback, trainer = rest(), Trainer()
+    callback.begin([labelled([SAFE] * 3)])
+    found = callback.consider(trainer, walking(nowhere))
+    assert found is not None
+    assert found.collision_rate == 1
+    assert found.excess > 1e6
+    better = callback.consider(trainer, walking(away))
+    assert better is not None
+    assert callback.best == better < found
+
+
+@pytest.mark.parametrize("name", GAMES)
+@pytest.mark.parametrize("value", [torch.nan, torch.inf, 1e30])
+def test_weights_that_diverged_collide_without_an_error(rest: Build, name: str, value: float) -> None:
+    game = make(name)
+    operator = operators.get("hno")(game, width=8, depth=1)
+    with torch.no_grad():
+        for weights in operator.net.parameters():
+            weights.fill_(value)
+    callback = rest(dt=0.1)
+    callback.begin([fake_labels(game, (1.0, 5.0), 3)])
+    found = callback.consider(Trainer(), operator)
+    assert found is not None
+    assert 0 <= found.collision_rate <= 1
+    if not math.isfinite(value):
+        assert found.collision_rate == 1
+
+
+@pytest.mark.parametrize("name", GAMES)
+@pytest.mark.parametrize("exact", [False, True])
+def test_episodes_are_those_of_the_evaluation(rest: Build, name: str, exact: bool) -> None:
+    """The same policy, starts and collisions as in the table of an evaluated checkpoint."""
+    torch.manual_seed(0)
+    game = make(name)
+    operator = operators.get("hno")(game, width=8, depth=1, exact_terminal=exact)
+    start = game.initial_box.sample(12, torch.Generator().manual_seed(0))
+    labels = [fake_labels(game, (1.0, 5.0), 12, start=start), fake_labels(game, (2.0, 2.0), 12, seed=1, start=start)]
+    callback = rest(dt=0.1, probe=12)
+    callback.begin(labels)
+    found = callback.consider(Trainer(), operator)
+    rows = collision_table(game, OperatorPolicy(operator.eval().requires_grad_(False)), labels, [], dt=0.1)
+    assert found is not None
+    assert found.collision_rate == pytest.approx(sum(row.collisions for row in rows) / 24)
+    single = [row.median_excess_cost for row in rows]
+    assert min(single) <= found.excess * float(starts_of(labels).cost.median()) <= max(single)
+
+
+@pytest.fixture
+def episodes(monkeypatch: pytest.MonkeyPatch) -> list[Tensor]:
+    """Start states of every simulation that a validation asks for."""
+    seen: list[Tensor] = []
+    original = module.rollout
+
+    def watched(game: Game, policy: object, x0: Tensor, *arguments: object) -> Trajectory:
+        seen.append(x0)
+        return original(game, policy, x0, *arguments)
+
+    monkeypatch.setattr(module, "rollout", watched)
+    return seen
+
+
+def test_all_starts_are_played_only_where_the_first_ones_are_safe(
+    rest: Build, walking: Walking, episodes: list[Tensor]
+) -> None:
+    callback = rest(probe=2)
+    callback.begin([labelled([SAFE, SAFE, SAFE, CLOSE, SAFE]), labelled([SAFE, SAFE, CLOSE], theta=2.0)])
+    found = callback.consider(Trainer(), walking(straight))
+    assert [len(x0) for x0 in episodes] == [4, 8]
+    assert bool((episodes[0][..., 1] == SAFE).all())
+    assert found is not None
+    assert found.collision_rate == 2 / 8
+
+
+def test_where_one_of_the_first_starts_collides_the_others_wait(
+    rest: Build, walking: Walking, episodes: list[Tensor]
+) -> None:
+    callback = rest(probe=2)
+    callback.begin([labelled([SAFE] * 5), labelled([SAFE, CLOSE, SAFE, SAFE], theta=2.0)])
+    found = callback.consider(Trainer(), walking(straight))
+    assert [len(x0) for x0 in episodes] == [4]
+    assert found is not None
+    assert found.collision_rate == 1 / 4
+
+
+def test_where_the_first_ones_are_all_they_are_played_once(
+    rest: Build, walking: Walking, episodes: list[Tensor]
+) -> None:
+    callback = rest(probe=3)
+    callback.begin([labelled([SAFE] * 3), labelled([SAFE] * 2, theta=2.0)])
+    found = callback.consider(Trainer(), walking(straight))
+    assert [len(x0) for x0 in episodes] == [5]
+    assert found is not None
+    assert found.collision_rate == 0
+
+
+def test_a_validation_without_starts_rests(rest: Build, walking: Walking, tmp_path: Path) -> None:
+    for callback in (rest(), rest()):
+        trainer = Trainer()
+        assert callback.consider(trainer, walking(straight)) is None
+        trainer.global_step = 10
+        callback.on_train_batch_end(trainer, walking(straight), None, None, 0)
+        callback.begin([])
+    assert list(tmp_path.iterdir()) == []
+    assert callback.state_dict() == {"best": None}
+
+
+def test_it_plays_every_so_often_and_at_the_end(
+    rest: Build, walking: Walking, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    steps: list[int] = []
+
+    def play(self: ClosedLoopValidation, trainer: Trainer, *others: object) -> Score:
+        steps.append(trainer.global_step)
+        return Score(1.0, 0.0)
+
+    monkeypatch.setattr(ClosedLoopValidation, "play", play)
+    callback, operator, trainer = rest(every=4), walking(straight), Trainer(max_steps=10)
+    callback.begin([labelled([SAFE])])
+    for trainer.global_step in range(1, 11):
+        callback.on_train_batch_end(trainer, operator, None, None, trainer.global_step - 1)
+    assert steps == [4, 8, 10]
+    even = Trainer(max_steps=8)
+    for even.global_step in range(1, 9):
+        callback.on_train_batch_end(even, operator, None, None, even.global_step - 1)
+    assert steps == [4, 8, 10, 4, 8]
+
+
+def test_best_checkpoint_is_that_of_the_best_score(
+    rest: Build, walking: Walking, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Of equal scores, the last."""
+    scores = [
+        Score(1.0, math.inf), Score(1.0, math.inf), Score(0.5, 0.1), Score(0.5, 0.2), Score(0.6, -9.0), Score(0.2, 9.0),
+        Score(0.2, 9.0), Score(0.0, math.inf), Score(0.01, -1.0), Score(0.0, 3.0), Score(0.0, math.nan),
+        Score(math.nan, 0.0), Score(0.0, 2.9),
+    ]  # fmt: skip
+    kept = [1, 2, 3, 3, 3, 6, 7, 8, 8, 10, 10, 10, 13]
+    monkeypatch.setattr(ClosedLoopValidation, "play", lambda self, trainer, *_: scores[trainer.global_step - 1])
+    callback, operator, trainer = rest(every=1), walking(straight), Trainer()
+    callback.begin([labelled([SAFE])])
+    for number, step in enumerate(kept):
+        trainer.global_step = number + 1
+        callback.on_train_batch_end(trainer, operator, None, None, number)
+        assert (tmp_path / BEST).read_text() == str(step)
+        assert callback.best == scores[step - 1]
+
+
+@pytest.mark.parametrize("stop", [False, True])
+def test_training_ends_once_it_is_safe_if_asked(rest: Build, walking: Walking, stop: bool) -> None:
+    callback, trainer = rest(stop=stop, every=1, probe=1), Trainer()
+    callback.begin([labelled([SAFE, CLOSE])])
+    trainer.global_step = 1
+    callback.on_train_batch_end(trainer, walking(straight), None, None, 0)
+    assert not trainer.should_stop, "the first ones are safe, but not all"
+    callback.on_train_batch_end(trainer, walking(nowhere), None, None, 1)
+    assert not trainer.should_stop
+    callback.on_train_batch_end(trainer, walking(away), None, None, 2)
+    assert trainer.should_stop == stop
+
+
+def test_what_was_found_is_logged(rest: Build, walking: Walking, monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[dict[str, float]] = []
+    operator, trainer, callback = walking(straight), Trainer(), rest(every=1)
+    monkeypatch.setattr(ValueOperator, "log_dict", lambda self, values, **kwargs: told.append(values))
+    callback.begin([labelled([SAFE, CLOSE], excess=0.5)])
+    callback.on_train_batch_end(trainer, operator, None, None, 0)
+    assert told == [
+        {"closed_loop/collision_rate": 0.5, "closed_loop/excess": pytest.approx(0.5, abs=1e-3)}
+    ]
+    assert 0 < callback.seconds < 60
+
+
+def test_data_are_told_where_the_first_starts_led(rest: Build, walking: Walking, tmp_path: Path) -> None:
+    arguments = {"types": [(1.0, 1.0)], "trajectories": 2, "cache": tmp_path, "seed": 0}
+    sizes = {"bvp": 4, "interior": 4, "terminal": 4}
+    data = GameData(
+        Walkers(), {"interior"}, batch_sizes=sizes, curriculum=Curriculum(0, 0), shares={"rollout": 1.0}, **arguments
+    )
+    callback = rest(probe=2, dt=0.1)
+    callback.begin([labelled([SAFE, 0.7, 0.5])])
+    callback.consider(Trainer(datamodule=data), walking(straight))
+    assert data.visited is not None
+    times, states = data.visited
+    assert times.shape == (2 * 11,)
+    torch.testing.assert_close(states[..., 0], 4 * (1 - times).unsqueeze(-1).expand(-1, 2))
+    assert set(states[..., 1].flatten().tolist()) == {torch.tensor(SAFE).item(), torch.tensor(0.7).item()}
+    callback.consider(Trainer(datamodule=data), walking(away))
+    torch.testing.assert_close(data.visited[1][..., 0], -4 * (1 - times).unsqueeze(-1).expand(-1, 2))
+    assert callback.consider(Trainer(datamodule=object()), walking(away)) is not None
+
+
+def test_the_best_score_survives_a_checkpoint(rest: Build, walking: Walking, tmp_path: Path) -> None:
+    first = rest()
+    first.begin([labelled([SAFE, CLOSE])])
+    first.consider(Trainer(), walking(away))
+    resumed = rest()
+    resumed.load_state_dict(first.state_dict())
+    assert resumed.best == first.best
+    assert isinstance(resumed.best, Score)
+    resumed.begin([labelled([SAFE, CLOSE])])
+    trainer = Trainer()
+    trainer.global_step = 77
+    resumed.consider(trainer, walking(straight))
+    assert (tmp_path / BEST).read_text() == "0", "worse than before the interruption"
+
+
+def test_a_best_score_without_its_checkpoint_is_forgotten(rest: Build, walking: Walking, tmp_path: Path) -> None:
+    first = rest()
+    first.begin([labelled([SAFE, CLOSE])])
+    first.consider(Trainer(), walking(away))
+    (tmp_path / BEST).unlink()
+    resumed = rest()
+    resumed.load_state_dict(first.state_dict())
+    assert resumed.best is None
+    resumed.begin([labelled([SAFE, CLOSE])])
+    resumed.consider(Trainer(), walking(straight))
+    assert (tmp_path / BEST).exists()
+
+
+def test_a_state_without_a_score_is_one_too(rest: Build) -> None:
+    callback = rest()
+    callback.load_state_dict(rest().state_dict())
+    assert callback.best is None
+
+
+def test_starts_keep_the_order_of_their_labels() -> None:
+    labels = [labelled([SAFE, CLOSE]), labelled([0.5], theta=2.0)]
+    starts = starts_of(labels)
+    whole = join(labels)
+    assert torch.equal(starts.x0, whole.x[:, 0].float())
+    assert torch.equal(starts.theta, whole.theta.float())
+    torch.testing.assert_close(starts.cost, -whole.value[:, 0].sum(-1).float())
+
+
+@pytest.mark.xfail(raises=RuntimeError, reason="starts stay float32: trainer.precision=64-true fails", strict=True)
+def test_an_operator_in_double_precision_is_validated(rest: Build) -> None:
+    game = make("narrow_road")
+    operator = operators.get("hno")(game, width=8, depth=1).double()
+    callback = rest(dt=0.1)
+    callback.begin([fake_labels(game, (1.0, 5.0), 3)])
+    assert callback.consider(Trainer(), operator) is not None
+
+
+@pytest.mark.xfail(reason="starts stay on the CPU: training on any other device fails", strict=True)
+def test_starts_go_to_the_device_of_the_operator(rest: Build, monkeypatch: pytest.MonkeyPatch) -> None:
+    devices: list[str] = []
+
+    class Seen(Exception):
+        pass
+
+    def look(game: Game, policy: object, x0: Tensor, theta: Tensor, *others: object) -> Trajectory:
+        devices.extend((x0.device.type, theta.device.type))
+        raise Seen
+
+    monkeypatch.setattr(module, "rollout", look)
+    game = make("narrow_road")
+    operator = operators.get("hno")(game, width=8, depth=1).to("meta")
+    callback = rest()
+    callback.begin([fake_labels(game, (1.0, 5.0), 3)])
+    with pytest.raises(Seen):
+        callback.consider(Trainer(), operator)
+    assert devices == ["meta", "meta"]
