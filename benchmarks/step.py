@@ -1,6 +1,6 @@
 """How much faster a training step is than one written the published way, on the same rows and weights.
 
-    python benchmarks/step.py [--game narrow_road] [--rows 16384 2048] [--repeats 15] [--device cpu]
+    python benchmarks/step.py [--game narrow_road] [--rows 16384 2048] [--repeats 15] [--compile]
 
 The baseline runs the branch for every row, takes one second-order autograd pass per player, loops over types and steps
 Adam with its default settings. Half of the rows carry labels, three eighths are collocation points, one eighth is at
@@ -131,12 +131,14 @@ def difference(ours: Iterator[Tensor], theirs: Iterator[Tensor]) -> float:
     return max(float((a - b).abs().max() / b.abs().max()) for a, b in zip(ours, theirs, strict=True))
 
 
-def measure(name: str, rows: int, repeats: int, device: torch.device) -> dict[str, float]:
+def measure(name: str, rows: int, repeats: int, device: torch.device, *, compiles: bool) -> dict[str, float]:
     """Medians of both steps, alternating."""
     torch.manual_seed(0)
     ours = operators.get("hno")(make(name)).to(device)
     ours.log_dict = ours.log = lambda *_, **__: None  # type: ignore[method-assign]  # there is no trainer to log to
     theirs = copy.deepcopy(ours)
+    if compiles:
+        ours.compile_kernels()
     batch = ours.transfer_batch_to_device(random_batch(ours, rows), device, 0)
     losses = (lambda: published_loss(theirs, batch)), (lambda: ours.training_step(batch, 0))
     error = difference(gradients(ours, losses[1]), gradients(theirs, losses[0]))
@@ -156,9 +158,11 @@ def main() -> None:
     parser.add_argument("--rows", type=int, nargs="+", default=[16384, 2048])
     parser.add_argument("--repeats", type=int, default=15)
     parser.add_argument("--device", default="cpu")
+    parser.add_argument("--compile", action="store_true", help="compile our step, not the baseline")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    found = [measure(arguments.game, n, arguments.repeats, torch.device(arguments.device)) for n in arguments.rows]
+    device, compiles = torch.device(arguments.device), arguments.compile
+    found = [measure(arguments.game, n, arguments.repeats, device, compiles=compiles) for n in arguments.rows]
     print(f"{'rows':>8s}{'published':>14s}{'ours':>14s}{'ratio':>8s}{'rows/s':>12s}{'gradients differ by':>22s}")
     for row in found:
         each = [1e6 * row[which] / row["rows"] for which in ("baseline_s", "ours_s")]

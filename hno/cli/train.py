@@ -35,6 +35,9 @@ from hno.types import Extremal, part
 
 log = logging.getLogger(__name__)
 
+LONG = 20_000
+"""Steps from which on compiling pays: it takes some ten seconds and saves about a millisecond a step (benchmarks/step.py)."""
+
 
 def main() -> None:
     """Entry point."""
@@ -98,6 +101,8 @@ def fit(config: DictConfig, folder: Path, results: Results) -> L.Trainer:
     if config.trainer.threads is not None:
         torch.set_num_threads(config.trainer.threads)
     operator = build_operator(config, build_game(config))
+    if config.trainer.compile and config.trainer.max_steps >= LONG:
+        operator.compile_kernels()
     data = build_data(config, operator, label_progress())
     operator.seen_types, operator.config_hash = data.type_list, config_hash(config)
     check_validation(data.game, config.validation)

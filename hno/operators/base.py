@@ -17,6 +17,7 @@ from torchmetrics import WeightedMeanAbsolutePercentageError
 from hno.games import Game, games
 from hno.losses import LossTerm, Norm, Scales
 from hno.operators.deeponet import DeepONet
+from hno.operators.value_gradient import compiled
 from hno.pontryagin.adjoint import terminal_costate
 from hno.registry import Registry
 from hno.types import Batch, Field, Points, Sample, Types
@@ -115,6 +116,10 @@ class ValueOperator(L.LightningModule, abc.ABC):
     def streams(self) -> frozenset[str]:
         """Data streams that the weighted terms read."""
         return frozenset(term.stream for name, term in self.terms.items() if self.weights.get(name, 0) > 0)
+
+    def compile_kernels(self) -> None:
+        """Train through `torch.compile`, which pays in long runs."""
+        self.net.kernels = compiled()
 
     def names(self) -> dict[str, str]:
         """Registered names of game, operator and activation."""

@@ -6,13 +6,17 @@ pass forward and one backward, not the second-order graph that `autograd.grad(..
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import functools
+import logging
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from hno.operators.activations import Activation
+from hno.operators.activations import Activation, activations
+
+log = logging.getLogger(__name__)
 
 CPU_BLOCK = 1024
 """Rows that are processed at a time on a CPU: what is kept of them fits into its cache."""
@@ -43,8 +47,22 @@ class _Block(NamedTuple):
     """dV / d output of the layer; times `firsts` it is dV / d argument of the core."""
 
 
+class Kernels(NamedTuple):
+    """The two computations on a block of rows, plain or compiled."""
+
+    forward: Callable[..., tuple[Tensor, Tensor, _Block]]
+    """See `_forward`."""
+    backward: Callable[..., Tensor]
+    """See `_backward`."""
+
+
 def value_gradient(
-    activation: type[Activation], y: Tensor, which: Tensor, coefficient: Tensor, layers: Sequence[Layer]
+    activation: type[Activation],
+    y: Tensor,
+    which: Tensor,
+    coefficient: Tensor,
+    layers: Sequence[Layer],
+    kernels: Kernels | None = None,
 ) -> tuple[Tensor, Tensor]:
     """<coefficient[which], h> and its gradient in y, where h is what the layers make of y.
 
@@ -54,27 +72,34 @@ def value_gradient(
         which: row of the coefficients, (R,).
         coefficient: (C, width).
         layers: hidden layers, from the first.
+        kernels: `compiled()`, or `EAGER`, the default.
 
     Returns:
         Shapes (R,) and (R, inputs), differentiable in coefficients, weights and biases.
     """
     flat = [part for layer in layers for part in layer]
-    value, gradient = _ValueGradient.apply(activation, y, which, coefficient, *flat)  # type: ignore[no-untyped-call]
+    value, gradient = _ValueGradient.apply(kernels or EAGER, activation, y, which, coefficient, *flat)  # type: ignore[no-untyped-call]
     return value, gradient
 
 
 class _ValueGradient(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, activation: type[Activation], y: Tensor, which: Tensor, coefficient: Tensor, *flat: Tensor
+        ctx: Any,
+        kernels: Kernels,
+        activation: type[Activation],
+        y: Tensor,
+        which: Tensor,
+        coefficient: Tensor,
+        *flat: Tensor,
     ) -> tuple[Tensor, Tensor]:
         layers = _layers(flat)
         keep = len(y) <= KEPT and any(ctx.needs_input_grad)
-        ctx.activation, ctx.blocks = activation, []
+        ctx.kernels, ctx.activation, ctx.blocks = kernels, activation, []
         ctx.save_for_backward(y, which, coefficient, *flat)
         values, gradients = [], []
         for rows, index in _split(y, which):
-            value, gradient, block = _forward(activation, rows, coefficient[index], layers)
+            value, gradient, block = kernels.forward(activation, rows, coefficient[index], layers)
             values.append(value)
             gradients.append(gradient)
             ctx.blocks += [block] if keep else []
@@ -83,13 +108,14 @@ class _ValueGradient(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *cotangents: Tensor) -> tuple[Tensor | None, ...]:
         y, which, coefficient, *flat = ctx.saved_tensors
+        forward, backward = ctx.kernels
         layers = _layers(flat)
         sums = [torch.zeros_like(part) for part in (coefficient, *flat)]
         parts = zip(_split(y, which), *(part.split(_block(y)) for part in cotangents), strict=True)
         for number, ((rows, index), dvalue, dgradient) in enumerate(parts):
-            kept = ctx.blocks[number] if ctx.blocks else _forward(ctx.activation, rows, coefficient[index], layers)[2]
-            sums[0].index_add_(0, index, _backward(ctx.activation, kept, layers, dvalue, dgradient, sums[1:]))
-        return None, None, None, *sums
+            kept = ctx.blocks[number] if ctx.blocks else forward(ctx.activation, rows, coefficient[index], layers)[2]
+            sums[0].index_add_(0, index, backward(ctx.activation, kept, layers, dvalue, dgradient, sums[1:]))
+        return None, None, None, None, *sums
 
 
 def _forward(
@@ -133,6 +159,24 @@ def _backward(
         sums[2 * k + 1].add_(du.sum(0))
         dh = du @ layers[k].weight
     return dcoefficient
+
+
+EAGER = Kernels(_forward, _backward)
+
+
+@functools.cache
+def compiled() -> Kernels:
+    """The kernels through `torch.compile`, in some ten seconds; `EAGER` with a warning where it does not work."""
+    kernels = Kernels(torch.compile(_forward), torch.compile(_backward))
+    y, which, coefficient = torch.zeros(8, 3), torch.zeros(8, dtype=torch.int64), torch.zeros(1, 4, requires_grad=True)
+    layers = [Layer(torch.zeros(4, 3), torch.zeros(4)), Layer(torch.zeros(4, 4), torch.zeros(4))]
+    try:
+        value, gradient = value_gradient(activations.get("tanh"), y, which, coefficient, layers, kernels)
+        (value.sum() + gradient.sum()).backward()
+    except (RuntimeError, OSError, ImportError) as error:
+        log.warning("torch.compile does not work here, so nothing is compiled: %s", str(error).splitlines()[0])
+        return EAGER
+    return kernels
 
 
 def _layers(flat: Sequence[Tensor]) -> list[Layer]:
