@@ -36,7 +36,7 @@ from hno.types import Extremal, part
 log = logging.getLogger(__name__)
 
 LONG = 20_000
-"""Steps from which on compiling pays: it takes some ten seconds and saves about a millisecond a step (benchmarks/step.py)."""
+"""Steps from which on compiling pays: it takes some ten seconds and saves about a millisecond a step."""
 
 
 def main() -> None:

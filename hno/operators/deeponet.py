@@ -101,7 +101,6 @@ class DeepONet(nn.Module):
         """
         hidden, last = self.trunk.folded()
         branch = self.branch(sensors)
-        value, gradient = value_gradient(
-            self.kernels, type(self.trunk.activation), y, which, branch @ last.weight, hidden
-        )
+        activation, coefficient = type(self.trunk.activation), branch @ last.weight
+        value, gradient = value_gradient(activation, y, which, coefficient, hidden, self.kernels)
         return value + (branch @ last.bias)[which], gradient
