@@ -165,7 +165,8 @@ class ValueOperator(L.LightningModule, abc.ABC):
             return Field(value, slope, costate)
         share = (tau / self.game.horizon).unsqueeze(-1)
         slope = value / self.game.horizon + share * slope
-        end = self.game.terminal_value(x), terminal_costate(self.game, x)
+        with torch.inference_mode(mode=False):
+            end = self.game.terminal_value(x), terminal_costate(self.game, x.clone())
         return Field(end[0] + share * value, slope, end[1] + share[..., None, None] * costate)
 
     def _inputs(self, tau: Tensor, x: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from hno.operators.activations import Activation, activations
-from hno.operators.value_gradient import EAGER, Layer, value_gradient
+from hno.operators.value_gradient import Kernels, Layer, value_gradient
 
 
 class MLP(nn.Module):
@@ -78,7 +78,7 @@ class DeepONet(nn.Module):
         hidden, make = (width,) * (depth + 1), activations.get(activation)
         self.trunk = MLP((trunk_inputs, *hidden), make(**options))
         self.branch = MLP((sensors, *hidden), make(**options))
-        self.kernels = EAGER
+        self.kernels: Kernels | None = None
 
     def forward(self, y: Tensor, sensors: Tensor, which: Tensor) -> Tensor:
         """Value at each row.

@@ -72,13 +72,15 @@ def value_gradient(
         which: row of the coefficients, (R,).
         coefficient: (C, width).
         layers: hidden layers, from the first.
-        kernels: `compiled()`, or `EAGER`, the default.
+        kernels: `compiled()`; plain ones by default.
 
     Returns:
         Shapes (R,) and (R, inputs), differentiable in coefficients, weights and biases.
     """
     flat = [part for layer in layers for part in layer]
-    value, gradient = _ValueGradient.apply(kernels or EAGER, activation, y, which, coefficient, *flat)  # type: ignore[no-untyped-call]
+    value, gradient = _ValueGradient.apply(
+        kernels or Kernels(_forward, _backward), activation, y, which, coefficient, *flat
+    )  # type: ignore[no-untyped-call]
     return value, gradient
 
 
@@ -161,12 +163,9 @@ def _backward(
     return dcoefficient
 
 
-EAGER = Kernels(_forward, _backward)
-
-
 @functools.cache
-def compiled() -> Kernels:
-    """The kernels through `torch.compile`, in some ten seconds; `EAGER` with a warning where it does not work."""
+def compiled() -> Kernels | None:
+    """The kernels through `torch.compile`, in some ten seconds; None, with a warning, where it does not work."""
     kernels = Kernels(torch.compile(_forward), torch.compile(_backward))
     y, which, coefficient = torch.zeros(8, 3), torch.zeros(8, dtype=torch.int64), torch.zeros(1, 4, requires_grad=True)
     layers = [Layer(torch.zeros(4, 3), torch.zeros(4)), Layer(torch.zeros(4, 4), torch.zeros(4))]
@@ -175,7 +174,7 @@ def compiled() -> Kernels:
         (value.sum() + gradient.sum()).backward()
     except (RuntimeError, OSError, ImportError) as error:
         log.warning("torch.compile does not work here, so nothing is compiled: %s", str(error).splitlines()[0])
-        return EAGER
+        return None
     return kernels
 
 
