@@ -78,9 +78,8 @@ def value_gradient(
         Shapes (R,) and (R, inputs), differentiable in coefficients, weights and biases.
     """
     flat = [part for layer in layers for part in layer]
-    value, gradient = _ValueGradient.apply(
-        kernels or Kernels(_forward, _backward), activation, y, which, coefficient, *flat
-    )  # type: ignore[no-untyped-call]
+    both = kernels or Kernels(_forward, _backward)
+    value, gradient = _ValueGradient.apply(both, activation, y, which, coefficient, *flat)  # type: ignore[no-untyped-call]
     return value, gradient
 
 
