@@ -1,6 +1,6 @@
 """Where a trained model satisfies the HJI equation, and whether that makes it safe.
 
-    python benchmarks/residual.py outputs/recipes/corners/lane_change/*/0
+    python benchmarks/residual.py "outputs/recipes/any type/lane_change/"*/0
 
 Prints, for every run folder of benchmarks/recipes.py, the mean residual as the loss measures it (relative to values per
 horizon plus the local penalty) uniformly in the PDE box, in the band around the constraint and around label states, at
