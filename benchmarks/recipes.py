@@ -73,18 +73,20 @@ MOST = {"half types": 256, "beyond": 512, "1.5 x box": 256, "2 x box": 256}
 """Start states of a type after which the search for safe ones ends, where it is not 4096."""
 
 CORNERS = "data.types=[[1,1],[1,5],[5,1],[5,5]]"
-SHORT = "operator=sno trainer.max_steps=1000"
+STEPS = "trainer.max_steps=1000"
+SHORT = f"operator=sno {STEPS}"
 FIFTEEN = str([[a, b] for a, b in itertools.combinations_with_replacement(range(1, 6), 2)]).replace(" ", "")
-BOX = "operator=hno data.interior_types=box"
+ANY = f"{STEPS} {CORNERS} operator=hno data.interior_types=box data.trajectories=200"
 RECIPES: dict[str, dict[str, str]] = {
+    "default": {"sno": "operator=sno", "hno": "operator=hno"},
     "hypothesis": {
-        "sno": "operator=sno",
-        "hno": "operator=hno",
-        "sno, time of hno": "operator=sno trainer.max_steps=2450",
-        "sno, corners": f"{CORNERS} operator=sno data.trajectories=200",
-        "hno, corners": f"{CORNERS} operator=hno data.trajectories=200",
-        "sno, corners, 50": f"{CORNERS} operator=sno data.trajectories=50",
-        "hno, corners, 50": f"{CORNERS} operator=hno data.trajectories=50",
+        "sno": f"{STEPS} operator=sno",
+        "hno": f"{STEPS} operator=hno",
+        "sno, time of hno": "trainer.max_steps=1250 operator=sno",
+        "sno, corners": f"{STEPS} {CORNERS} operator=sno data.trajectories=200",
+        "hno, corners": f"{STEPS} {CORNERS} operator=hno data.trajectories=200",
+        "sno, corners, 50": f"{STEPS} {CORNERS} operator=sno data.trajectories=50",
+        "hno, corners, 50": f"{STEPS} {CORNERS} operator=hno data.trajectories=50",
     },
     "activations": {
         f"{name} {rate}": f"operator=sno activation={name} optimizer.lr={rate} trainer.max_steps=1000"
@@ -125,11 +127,11 @@ RECIPES: dict[str, dict[str, str]] = {
         "15 types x 75": f"{SHORT} data.trajectories=75 data.types={FIFTEEN}",
     },
     "any type": {
-        "0.1": f"{CORNERS} {BOX} data.trajectories=200 loss.weights.residual=0.1",
-        "0.01": f"{CORNERS} {BOX} data.trajectories=200 loss.weights.residual=0.01",
-        "0.1, around labels": f"{CORNERS} {BOX} data.trajectories=200 loss.weights.residual=0.1 sampler=labels",
-        "0.1, rollouts": f"{CORNERS} {BOX} data.trajectories=200 loss.weights.residual=0.1 sampler=rollout",
-        "0.1, whole horizon at once": f"{CORNERS} {BOX} data.trajectories=200 loss.weights.residual=0.1 data.widening=0",
+        "0.1": f"{ANY} loss.weights.residual=0.1",
+        "0.01": f"{ANY} loss.weights.residual=0.01",
+        "0.1, around labels": f"{ANY} loss.weights.residual=0.1 sampler=labels",
+        "0.1, rollouts": f"{ANY} loss.weights.residual=0.1 sampler=rollout",
+        "0.1, whole horizon at once": f"{ANY} loss.weights.residual=0.1 data.widening=0",
     },
 }
 """Overrides by name, by set."""
