@@ -73,7 +73,7 @@ MOST = {"half types": 256, "beyond": 512, "1.5 x box": 256, "2 x box": 256}
 """Start states of a type after which the search for safe ones ends, where it is not 4096."""
 
 CORNERS = "data.types=[[1,1],[1,5],[5,1],[5,5]]"
-STEPS = "trainer.max_steps=1000"
+STEPS = "trainer.max_steps=1000 optimizer.lr=1e-2"
 SHORT = f"operator=sno {STEPS}"
 FIFTEEN = str([[a, b] for a, b in itertools.combinations_with_replacement(range(1, 6), 2)]).replace(" ", "")
 ANY = f"{STEPS} {CORNERS} operator=hno data.interior_types=box data.trajectories=200"
@@ -82,7 +82,7 @@ RECIPES: dict[str, dict[str, str]] = {
     "hypothesis": {
         "sno": f"{STEPS} operator=sno",
         "hno": f"{STEPS} operator=hno",
-        "sno, time of hno": "trainer.max_steps=1250 operator=sno",
+        "sno, time of hno": f"{STEPS} trainer.max_steps=1250 operator=sno",
         "sno, corners": f"{STEPS} {CORNERS} operator=sno data.trajectories=200",
         "hno, corners": f"{STEPS} {CORNERS} operator=hno data.trajectories=200",
         "sno, corners, 50": f"{STEPS} {CORNERS} operator=sno data.trajectories=50",
@@ -93,15 +93,15 @@ RECIPES: dict[str, dict[str, str]] = {
         for name, rate in itertools.product(("tanh", "relu", "sin", "sin activation.frequency=10"), (1e-3, 3e-3, 1e-2))
     },
     "optimizers": {
-        "soap 3e-3": SHORT,
-        "soap 1e-2": f"{SHORT} optimizer.lr=1e-2",
-        "soap 3e-3, polish": f"{SHORT} trainer.polish=100",
-        "soap 3e-3, linear": f"{SHORT} optimizer.schedule=linear",
-        "soap 3e-3, clip 1": f"{SHORT} trainer.gradient_clip_val=1.0",
-        "adam 3e-3": f"{SHORT} optimizer=adam",
+        "soap 1e-2": SHORT,
+        "soap 3e-3": f"{SHORT} optimizer.lr=3e-3",
+        "soap 1e-2, polish": f"{SHORT} trainer.polish=100",
+        "soap 1e-2, linear": f"{SHORT} optimizer.schedule=linear",
+        "soap 1e-2, clip 1": f"{SHORT} trainer.gradient_clip_val=1.0",
+        "adam 3e-3": f"{SHORT} optimizer=adam optimizer.lr=3e-3",
         "adam 1e-2": f"{SHORT} optimizer=adam optimizer.lr=1e-2",
         "adamw 1e-2": f"{SHORT} optimizer=adamw optimizer.lr=1e-2",
-        "muon 2e-2": f"{SHORT} optimizer=muon",
+        "muon 2e-2": f"{SHORT} optimizer=muon optimizer.lr=2e-2",
     },
     "losses": {
         "huber": f"{SHORT} loss.norm=huber",
