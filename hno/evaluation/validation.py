@@ -48,6 +48,10 @@ class Starts(NamedTuple):
     cost: Tensor
     """Joint cost of the equilibrium, (B,)."""
 
+    def on(self, device: torch.device) -> Starts:
+        """The same on a device."""
+        return Starts(*(column.to(device) for column in self))
+
 
 def starts_of(labels: Sequence[Extremal]) -> Starts:
     """Starts of labels, float32."""
@@ -123,13 +127,13 @@ class ClosedLoopValidation(L.Callback):
             """As `OperatorPolicy`, but an operator that diverged just collides."""
             return game.optimal_control(x, operator.field(Points(tau, x, theta)).costate)
 
-        game = operator.game
-        played = rollout(game, policy, self.probe.x0, self.probe.theta, self.dt)
+        game, probe, starts = operator.game, self.probe.on(operator.device), starts.on(operator.device)
+        played = rollout(game, policy, probe.x0, probe.theta, self.dt)
         data = getattr(trainer, "datamodule", None)
         if isinstance(data, GameData):
             data.visit(played)
-        found = score(played, self.probe)
-        if found.collision_rate > 0 or len(starts.cost) == len(self.probe.cost):
+        found = score(played, probe)
+        if found.collision_rate > 0 or len(starts.cost) == len(probe.cost):
             return found
         return score(rollout(game, policy, starts.x0, starts.theta, self.dt), starts)
 
