@@ -76,6 +76,7 @@ CORNERS = "data.types=[[1,1],[1,5],[5,1],[5,5]]"
 STEPS = "trainer.max_steps=1000 optimizer.lr=1e-2"
 SHORT = f"operator=sno {STEPS}"
 FIFTEEN = str([[a, b] for a, b in itertools.combinations_with_replacement(range(1, 6), 2)]).replace(" ", "")
+TEN = f"{STEPS} {CORNERS} data.trajectories=10"
 ANY = f"{STEPS} {CORNERS} operator=hno data.interior_types=box data.trajectories=200"
 RECIPES: dict[str, dict[str, str]] = {
     "default": {"sno": "operator=sno", "hno": "operator=hno"},
@@ -125,6 +126,13 @@ RECIPES: dict[str, dict[str, str]] = {
         "4 types x 280": f"{SHORT} {CORNERS} data.trajectories=280",
         "7 types x 160": SHORT,
         "15 types x 75": f"{SHORT} data.trajectories=75 data.types={FIFTEEN}",
+    },
+    "ten labels": {
+        "sno": f"{TEN} operator=sno",
+        "hno 0.02": f"{TEN} operator=hno",
+        "hno 0.1": f"{TEN} operator=hno loss.weights.residual=0.1",
+        "hno 0.1, around labels": f"{TEN} operator=hno loss.weights.residual=0.1 sampler=labels",
+        "hno 0.002": f"{TEN} operator=hno loss.weights.residual=0.002",
     },
     "any type": {
         "0.1": f"{ANY} loss.weights.residual=0.1",
