@@ -23,7 +23,7 @@ from torch import Tensor
 from hno.games import make
 from hno.losses import Scales, hji_residual
 from hno.operators import ValueOperator, operators
-from hno.operators.base import ego_views
+from hno.operators.inputs import ego_views
 from hno.types import Batch, Field, Labels, Points, Sample, Types
 
 TYPES = torch.tensor([[1.0, 1], [1, 5], [5, 1], [5, 5], [1, 3], [3, 3], [3, 5]])

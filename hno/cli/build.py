@@ -32,6 +32,11 @@ SIZES = (
     "trainer.validate_every", "trainer.print_every", "trainer.threads", "evaluation.starts",
 )  # fmt: skip
 """Entries that must be whole and positive where they are set."""
+FLAGS = (
+    "operator.exact_terminal", "loss.scaled", "loss.balance", "trainer.compile", "validation.stop_when_safe",
+    "evaluation.safe",
+)  # fmt: skip
+"""Entries that are true or false."""
 
 
 def check_numbers(config: DictConfig) -> None:
@@ -40,8 +45,16 @@ def check_numbers(config: DictConfig) -> None:
         value = OmegaConf.select(config, name)
         if value is not None and not (isinstance(value, int) and value > 0):
             raise ValueError(f"{name} must be a positive whole number; got {value!r}.")
-    if not (isinstance(config.optimizer.lr, (int, float)) and config.optimizer.lr > 0):
-        raise ValueError(f"optimizer.lr must be a positive number; got {config.optimizer.lr!r}.")
+    for name in ("optimizer.lr", "optimizer.final_lr"):
+        value = OmegaConf.select(config, name)
+        if not (isinstance(value, (int, float)) and value > 0):
+            raise ValueError(f"{name} must be a positive number; got {value!r}.")
+    for name in FLAGS:
+        value = OmegaConf.select(config, name)
+        if value is not None and not isinstance(value, bool):
+            raise ValueError(f"{name} must be true or false; got {value!r}.")
+    if not (isinstance(config.trainer.polish, int) and config.trainer.polish >= 0):
+        raise ValueError(f"trainer.polish must be a whole number of at least 0; got {config.trainer.polish!r}.")
     if not (isinstance(config.seed, int) and config.seed >= 0):
         raise ValueError(f"seed must be a whole number of at least 0; got {config.seed!r}.")
     for name, needed in (("data.types", not config.data.files), ("evaluation.types", False)):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 import math
 import time
@@ -99,7 +100,7 @@ def solve_tests(
 ) -> list[Extremal]:
     """Labels of the test starts of every type, from the cache or solved."""
     requests = [Request(theta, settings.starts, settings.seed, "test", float(settings.widen)) for theta in types]
-    solver = safe_labels_for if settings.safe else labels_for
+    solver = functools.partial(safe_labels_for, clearance=settings.clearance) if settings.safe else labels_for
     labels, seconds = solver(game, requests, cache, workers=workers, report=label_progress())
     results.time("test_labels", seconds)
     results.update(test_seed=settings.seed)

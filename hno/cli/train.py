@@ -80,6 +80,7 @@ def train(config: DictConfig) -> bool:
 
 
 def _run(config: DictConfig, folder: Path, results: Results) -> None:
+    check_numbers(config)
     settings = config.evaluation
     game = build_game(config)
     check_evaluation(game, settings)
@@ -111,7 +112,7 @@ def fit(config: DictConfig, folder: Path, results: Results) -> L.Trainer:
     trainer = build_trainer(config, folder, validation)
     if config.resume is not None:
         check_resumable(config.resume, operator)
-        _take_over(Path(config.resume).parent / BEST, folder / BEST)
+    _take_over(None if config.resume is None else Path(config.resume).parent / BEST, folder / BEST)
 
     data.prepare_data()
     data.setup("fit")
@@ -145,16 +146,19 @@ def validation_labels(config: DictConfig, data: GameData, results: Results) -> l
     if choice.types is not None:
         types = parse_types(data.game, choice.types)
         requests = [Request(theta, choice.starts, config.seed, "validation") for theta in types]
-        solved = safe_labels_for(data.game, requests, data.cache, config.data.workers, label_progress())
-        found, seconds = solved
+        found, seconds = safe_labels_for(
+            data.game, requests, data.cache, config.data.workers, label_progress(), clearance=clearance
+        )
         results.time("validation_labels", seconds)
     selected = [part(labels, safe(labels, clearance)) for labels in found]
     return [labels for labels in selected if len(labels.status)]
 
 
-def _take_over(best: Path, to: Path) -> None:
-    """The best checkpoint of the run that is resumed, where it was written to another folder."""
-    if best.exists() and best.resolve() != to.resolve():
+def _take_over(best: Path | None, to: Path) -> None:
+    """Go on from the best checkpoint of the run that is resumed; one of another run in our folder goes."""
+    if best is None or not best.exists():
+        to.unlink(missing_ok=True)
+    elif best.resolve() != to.resolve():
         shutil.copy2(best, to)
 
 

@@ -7,7 +7,7 @@ import hashlib
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import lightning as L
 import torch
@@ -24,6 +24,17 @@ from hno.types import Batch, Extremal, Labels, Points, Sample, Status, Trajector
 
 BOX_TYPES = 32
 """Types that one batch of collocation points draws from the type box: the branch runs once for each."""
+
+
+class Visit(NamedTuple):
+    """Where the closed-loop episodes of a validation went."""
+
+    step: int
+    """The training step after which they were played."""
+    tau: Tensor
+    """Times to go, (L,)."""
+    x: Tensor
+    """States, (L, P, n)."""
 
 
 class NoLabelsError(RuntimeError):
@@ -131,8 +142,8 @@ class GameData(L.LightningDataModule):
         self.validation = validation
         self.label_seconds = 0.0
         self.extremals: list[Extremal] = []
-        self.visited: tuple[Tensor, Tensor] | None = None
-        """Times to go (L,) and states (L, P, n) that the latest validation went through."""
+        self.visits: list[Visit] = []
+        """The latest two validations."""
 
     def prepare_data(self) -> None:
         """Solve what the cache lacks."""
@@ -165,24 +176,24 @@ class GameData(L.LightningDataModule):
         value = torch.where(value > 0, value, torch.ones_like(value))
         return value, labels.costate.abs().mean(0).maximum(1e-3 * value / self.game.state_box.width)
 
-    def visit(self, played: Trajectory) -> None:
-        """Take note of where closed-loop episodes went, as far as they stayed finite."""
+    def visit(self, played: Trajectory, step: int = -1) -> None:
+        """Take note of where the episodes of a validation after some step went, as far as they stayed finite."""
         tau = (self.game.horizon - played.t).expand(len(played.x), -1).flatten()
         x = played.x.flatten(0, 1)
         finite = x.flatten(1).isfinite().all(-1)
         if bool(finite.any()):
-            self.visited = (tau[finite].cpu(), x[finite].cpu())
+            self.visits = [*self.visits[-1:], Visit(step, tau[finite].cpu(), x[finite].cpu())]
 
     def state_dict(self) -> dict[str, Any]:
         """What batches depend on besides the step."""
-        return {} if self.visited is None else dict(zip(("tau", "x"), self.visited, strict=True))
+        return {"visits": [visit._asdict() for visit in self.visits]}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Go on from it."""
-        self.visited = (state_dict["tau"], state_dict["x"]) if state_dict else None
+        self.visits = [Visit(**visit) for visit in state_dict["visits"]]
 
     def batch(self, step: int) -> Batch:
-        """The batch of one step, a pure function of (seed, step, rank), and of `visited` if it is drawn from."""
+        """The batch of one step, a pure function of (seed, step, rank), and of earlier `visits`."""
         rank = self.trainer.global_rank if self.trainer is not None else 0
         generator = torch.Generator().manual_seed(_mix(step, self.seed, rank))
         batch: Batch = {}
@@ -190,7 +201,7 @@ class GameData(L.LightningDataModule):
             batch["bvp"] = self.train_rows.rows(self._row_numbers(generator))
         if self.curriculum.active(step):
             for name in sorted(self.streams & {"interior", "terminal"}):
-                batch[name] = self._collocation(name, self.curriculum.window(step), generator)
+                batch[name] = self._collocation(name, step, generator)
         return batch
 
     def large_batch(self, step: int) -> Batch:
@@ -209,15 +220,20 @@ class GameData(L.LightningDataModule):
             return torch.arange(self.train_rows.size)
         return torch.randint(self.train_rows.size, (size,), generator=generator)
 
-    def _collocation(self, stream: str, window: float, generator: torch.Generator) -> Sample:
+    def _visited(self, step: int) -> tuple[Tensor, Tensor] | None:
+        """Where the latest validation before a step went. Batches are drawn a step ahead: later ones do not count."""
+        earlier = [visit for visit in self.visits if visit.step < step]
+        return (earlier[-1].tau, earlier[-1].x) if earlier else None
+
+    def _collocation(self, stream: str, step: int, generator: torch.Generator) -> Sample:
         size = self.batch_sizes[stream] or self.train_rows.size
         table = self.types
         if self.interior_types == "box":
             table = self.game.type_box.sample(BOX_TYPES, generator)
         which = torch.randint(len(table), (size,), generator=generator)
         labelled = self.train_rows.points.tau, self.train_rows.points.x
-        pools = {"labels": labelled, "rollout": self.visited or labelled}
-        points = sample_states(self.game, table[which], self.shares, pools, window, generator)
+        pools = {"labels": labelled, "rollout": self._visited(step) or labelled}
+        points = sample_states(self.game, table[which], self.shares, pools, self.curriculum.window(step), generator)
         points = points._replace(tau=torch.zeros_like(points.tau)) if stream == "terminal" else points
         return Sample(points, types=Types(table, which))
 

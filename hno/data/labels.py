@@ -17,7 +17,7 @@ from torch import Tensor
 
 from hno.data.shards import SHARD, LabelSet
 from hno.data.store import canonical_json
-from hno.data.trust import safe
+from hno.data.trust import CLEARANCE, safe
 from hno.games import Game
 from hno.pontryagin.solve import Solver, solve
 from hno.types import Extremal, Status, part
@@ -155,10 +155,9 @@ def safe_labels_for(
     workers: int | None = None,
     report: Report | None = None,
     most: int = 4096,
+    clearance: float = CLEARANCE,
 ) -> tuple[list[Extremal], float]:
     """Labels of as many start states as it takes until `starts` of each request are safe.
-
-    A start is safe where its equilibrium keeps `hno.data.trust.CLEARANCE`.
 
     Args:
         game: the game.
@@ -167,6 +166,7 @@ def safe_labels_for(
         workers: see `labels_for`.
         report: called as labels are written.
         most: start states of a type after which the search for safe ones ends.
+        clearance: what the equilibrium of a safe start keeps, m for distance constraints.
 
     Returns:
         One `Extremal` per request, whose last row is the last safe start that was asked for, and the seconds spent.
@@ -177,7 +177,7 @@ def safe_labels_for(
         asked = [request._replace(starts=size) for request, size in zip(requests, sizes, strict=True)]
         found, spent = labels_for(game, asked, cache, workers=workers, report=report)
         seconds += spent
-        masks = [safe(labels) for labels in found]
+        masks = [safe(labels, clearance) for labels in found]
         grown = [_enough(*entry, most) for entry in zip(masks, wanted, strict=True)]
         if grown == sizes:
             return [

@@ -59,6 +59,8 @@ def sample_states(
     for name, (times, states) in pools.items():
         near = (source == SOURCES.index(name)).nonzero().squeeze(-1)
         inside = (times <= window * game.horizon).nonzero().squeeze(-1)
+        if len(inside) == 0:
+            continue  # episodes that were not finite: these points stay uniform
         row = inside[torch.randint(len(inside), (len(near),), generator=generator)]
         noise = spread * torch.randn(x[near].shape, generator=generator) * game.state_box.width
         tau[near], x[near] = times[row], game.state_box.clamp(states[row] + noise)

@@ -43,7 +43,7 @@ class StopOnDivergence(L.Callback):
         """Test the error of costates on held-out labels."""
         error = float(trainer.callback_metrics.get(ERROR, 0.0))
         self.smallest = min(self.smallest, error)
-        if not error <= self.growth * self.smallest:
+        if not (math.isfinite(error) and error <= self.growth * self.smallest):
             was = f"; it was {self.smallest:.3g}" if self.smallest < math.inf else ""
             raise DivergedError(
                 f"The error of costates is {error:.3g} at step {trainer.global_step}{was}: the training diverged. "

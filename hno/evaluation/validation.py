@@ -21,21 +21,25 @@ log = logging.getLogger(__name__)
 
 BEST = "best.ckpt"
 """Name of the best checkpoint inside a run's folder."""
+FEW = 4
+"""All starts are played anyway where they are at most so many times the first ones."""
 
 
 class Score(NamedTuple):
-    """How good a policy is: safety first, then cost, of which whole per cents count."""
+    """How good a policy is: safety first, then cost."""
 
     collision_rate: float
-    """Collisions per start."""
+    """Collisions per start; starts that were not played because others collided count as collisions."""
     excess: float
     """Median of the joint cost above the equilibrium's, relative to the median of the equilibrium's."""
 
-    def no_worse(self, other: Score) -> bool:
-        """Whether a later policy with this score replaces an earlier one: costs within a per cent are chance."""
-        if self.collision_rate != other.collision_rate:
-            return self.collision_rate < other.collision_rate
-        return self.excess <= other.excess + 0.01
+    def after(self, best: Score | None) -> Score | None:
+        """The best score once this one came after `best`; None if it is worse. Costs within a per cent are chance."""
+        if best is None or self.collision_rate < best.collision_rate:
+            return self
+        if not (self.collision_rate == best.collision_rate and self.excess <= best.excess + 0.01):
+            return None
+        return Score(self.collision_rate, min(self.excess, best.excess))
 
 
 class Starts(NamedTuple):
@@ -48,9 +52,9 @@ class Starts(NamedTuple):
     cost: Tensor
     """Joint cost of the equilibrium, (B,)."""
 
-    def on(self, device: torch.device) -> Starts:
-        """The same on a device."""
-        return Starts(*(column.to(device) for column in self))
+    def like(self, tensor: Tensor) -> Starts:
+        """The same in the type and on the device of a tensor."""
+        return Starts(*(column.to(tensor) for column in self))
 
 
 def starts_of(labels: Sequence[Extremal]) -> Starts:
@@ -69,7 +73,8 @@ def score(played: Trajectory, starts: Starts) -> Score:
 class ClosedLoopValidation(L.Callback):
     """Validate in closed loop every so often, keep the best checkpoint, and end the training once it is safe, if asked.
 
-    It rests unless it is given starts. The first ones of every type are played first; only if none collides are all.
+    It rests unless it is given starts. Where there are many, the first ones of every type are played first, and the
+    others only if none of these collides.
 
     Args:
         folder: where `best.ckpt` goes.
@@ -114,8 +119,9 @@ class ClosedLoopValidation(L.Callback):
             return None
         began = time.perf_counter()
         found = self.play(trainer, operator, self.all)
-        if self.best is None or found.no_worse(self.best):
-            self.best = found
+        better = found.after(self.best)
+        if better is not None:
+            self.best = better
             trainer.save_checkpoint(self.path, weights_only=False)
         self.seconds += time.perf_counter() - began
         return found
@@ -127,13 +133,16 @@ class ClosedLoopValidation(L.Callback):
             """As `OperatorPolicy`, but an operator that diverged just collides."""
             return game.optimal_control(x, operator.field(Points(tau, x, theta)).costate)
 
-        game, probe, starts = operator.game, self.probe.on(operator.device), starts.on(operator.device)
+        game, probe, starts = operator.game, self.probe.like(operator.value_scale), starts.like(operator.value_scale)
         played = rollout(game, policy, probe.x0, probe.theta, self.dt)
         data = getattr(trainer, "datamodule", None)
         if isinstance(data, GameData):
-            data.visit(played)
-        found = score(played, probe)
-        if found.collision_rate > 0 or len(starts.cost) == len(probe.cost):
+            data.visit(played, trainer.global_step)
+        found, count = score(played, probe), len(starts.cost)
+        if found.collision_rate > 0 and count > FEW * len(probe.cost):
+            hits = found.collision_rate * len(probe.cost)
+            return found._replace(collision_rate=(hits + count - len(probe.cost)) / count)
+        if count == len(probe.cost):
             return found
         return score(rollout(game, policy, starts.x0, starts.theta, self.dt), starts)
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import abc
-import itertools
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from types import MappingProxyType
 from typing import Any, ClassVar
 
@@ -17,6 +16,7 @@ from torchmetrics import WeightedMeanAbsolutePercentageError
 from hno.games import Game, games
 from hno.losses import LossTerm, Norm, Scales
 from hno.operators.deeponet import DeepONet
+from hno.operators.inputs import distinct_types, ego_views, tables
 from hno.operators.value_gradient import compiled
 from hno.pontryagin.adjoint import terminal_costate
 from hno.registry import Registry
@@ -90,7 +90,7 @@ class ValueOperator(L.LightningModule, abc.ABC):
         self.game = game
         self.optimizer = optimizer
         self.norm, self.scaled = Norm(norm), scaled
-        if not 0 < hardest <= 1:
+        if not (isinstance(hardest, (int, float)) and 0 < hardest <= 1):
             raise ValueError(f"loss.hardest is a share in (0, 1]; got {hardest!r}.")
         self.balance, self.hardest = balance, hardest
         self.losses = nn.ModuleDict({name: term() for name, term in self.terms.items()})
@@ -267,32 +267,3 @@ class ValueOperator(L.LightningModule, abc.ABC):
 
 def _is_weight(number: float) -> bool:
     return math.isfinite(number) and number >= 0
-
-
-def ego_views(x: Tensor, *, inverse: bool = False) -> Tensor:
-    """Each player's view of a joint quantity, itself first.
-
-    Args:
-        x: (B, P, n), or (B, P, P, n) with one copy per player already (needed for the inverse).
-        inverse: turn views back into the common order.
-
-    Returns:
-        (B, P, P, n); entry [..., i, j, :] is player (i + j) mod P, or its inverse.
-    """
-    players = x.shape[-2]
-    if not inverse:
-        return torch.stack([x.roll(-i, -2) for i in range(players)], -3)
-    return torch.stack([x[..., i, :, :].roll(i, -2) for i in range(players)], -3)
-
-
-def distinct_types(theta: Tensor) -> Types:
-    """The different types among (B, P) as a table; this waits for the device."""
-    distinct, which = theta.reshape(-1, theta.shape[-1]).unique(dim=0, return_inverse=True)
-    return Types(distinct, which)
-
-
-def tables(parts: Sequence[Types]) -> Types:
-    """One table for several batches of points, one after the other."""
-    offsets = itertools.accumulate((len(part.distinct) for part in parts), initial=0)
-    which = [part.which + offset for part, offset in zip(parts, offsets, strict=False)]
-    return Types(torch.cat([part.distinct for part in parts]), torch.cat(which))

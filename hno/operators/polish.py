@@ -35,7 +35,7 @@ def polish(operator: ValueOperator, batch: Batch, iterations: int) -> tuple[floa
         optimizer.zero_grad()
         total = loss()
         total.backward()
-        return float(total)
+        return float(total.detach())
 
     with torch.no_grad():
         before = float(loss())

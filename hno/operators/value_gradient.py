@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from hno.operators.activations import Activation, activations
 
@@ -77,7 +78,8 @@ def value_gradient(
     Returns:
         Shapes (R,) and (R, inputs), differentiable in coefficients, weights and biases.
     """
-    flat = [part for layer in layers for part in layer]
+    flat, dtype = [part for layer in layers for part in layer], layers[0].weight.dtype
+    y, coefficient = y.to(dtype), coefficient.to(dtype)
     both = kernels or Kernels(_forward, _backward)
     value, gradient = _ValueGradient.apply(both, activation, y, which, coefficient, *flat)  # type: ignore[no-untyped-call]
     return value, gradient
@@ -99,14 +101,16 @@ class _ValueGradient(torch.autograd.Function):
         ctx.kernels, ctx.activation, ctx.blocks = kernels, activation, []
         ctx.save_for_backward(y, which, coefficient, *flat)
         values, gradients = [], []
-        for rows, index in _split(y, which):
-            value, gradient, block = kernels.forward(activation, rows, coefficient[index], layers)
-            values.append(value)
-            gradients.append(gradient)
-            ctx.blocks += [block] if keep else []
+        with torch.autocast(y.device.type, enabled=False):  # derivatives of half-precision values are not worth much
+            for rows, index in _split(y, which):
+                value, gradient, block = kernels.forward(activation, rows, coefficient[index], layers)
+                values.append(value)
+                gradients.append(gradient)
+                ctx.blocks += [block] if keep else []
         return torch.cat(values), torch.cat(gradients)
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, *cotangents: Tensor) -> tuple[Tensor | None, ...]:
         y, which, coefficient, *flat = ctx.saved_tensors
         forward, backward = ctx.kernels

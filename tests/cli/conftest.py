@@ -90,8 +90,10 @@ def no_labels(monkeypatch: pytest.MonkeyPatch) -> None:
     def never(*arguments: object, **options: object) -> None:
         raise AssertionError("labels were asked for")
 
-    monkeypatch.setattr(datamodule, "labels_for", never)
-    monkeypatch.setattr(evaluate, "labels_for", never)
+    for module, name in (
+        (datamodule, "labels_for"), (evaluate, "labels_for"), (evaluate, "safe_labels_for"), (train, "safe_labels_for"),
+    ):  # fmt: skip
+        monkeypatch.setattr(module, name, never)
 
 
 def refused(run: Outcome, *fragments: str) -> None:

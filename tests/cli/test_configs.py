@@ -52,7 +52,7 @@ def test_every_experiment_builds_for_every_game_and_operator(experiment: str, ga
 def test_own_label_files_reach_the_data(tmp_path: Path) -> None:
     game, path = make("narrow_road"), tmp_path / "mine.safetensors"
     write_own(path, game, fake_labels(game, (2.5, 2.5), 12), "a test")
-    config = composed("game=narrow_road", f"data.files=[{path}]", "data.types=[]")
+    config = composed("game=narrow_road", f"data.files=[{path}]", "data.types=[]", "data.validation=2")
     check_numbers(config)
     data = build_data(config, build_operator(config, build_game(config)))
     assert data.type_list == [(2.5, 2.5)]

@@ -61,6 +61,7 @@ def test_errors_may_grow_within_the_factor(errors: list[float]) -> None:
         ([0.5, math.inf], "The error of costates is inf at step 200; it was 0.5: "),
         ([0.5, math.nan], "The error of costates is nan at step 200; it was 0.5: "),
         ([math.nan], "The error of costates is nan at step 100: "),
+        ([math.inf], "The error of costates is inf at step 100: "),
     ],
 )
 def test_an_error_beyond_the_factor_is_divergence(errors: list[float], message: str) -> None:

@@ -97,7 +97,7 @@ def labelled(heights: Sequence[float], theta: float = 1.0, excess: float | None 
 
 
 @pytest.fixture
-def rest(tmp_path: Path) -> Callable[..., ClosedLoopValidation]:
+def make_validation(tmp_path: Path) -> Callable[..., ClosedLoopValidation]:
     """A validation every 10 steps."""
 
     def build(**options: Any) -> ClosedLoopValidation:
@@ -111,8 +111,8 @@ Walking = Callable[[Play], ValueOperator]
 
 
 @pytest.mark.parametrize(("safe", "close"), [(4, 0), (3, 1), (1, 3), (0, 4)])
-def test_score_is_the_share_of_collisions(rest: Build, walking: Walking, safe: int, close: int) -> None:
-    callback = rest()
+def test_score_is_the_share_of_collisions(make_validation: Build, walking: Walking, safe: int, close: int) -> None:
+    callback = make_validation()
     callback.begin([labelled([SAFE] * safe + [CLOSE] * close)])
     found = callback.consider(Trainer(), walking(straight))
     assert found is not None
@@ -120,17 +120,19 @@ def test_score_is_the_share_of_collisions(rest: Build, walking: Walking, safe: i
 
 
 @pytest.mark.parametrize("excess", [0.0, 0.25, -0.2, 3.0])
-def test_excess_is_relative_to_the_cost_of_the_equilibria(rest: Build, walking: Walking, excess: float) -> None:
-    callback = rest()
+def test_excess_is_relative_to_the_cost_of_the_equilibria(
+    make_validation: Build, walking: Walking, excess: float
+) -> None:
+    callback = make_validation()
     callback.begin([labelled([0.5, 0.6, 0.9], excess=excess), labelled([0.7, 0.8], theta=2.0, excess=excess)])
     found = callback.consider(Trainer(), walking(straight))
     assert found is not None
     assert found.excess == pytest.approx(excess, abs=1e-4)
 
 
-def test_score_looks_at_the_types_of_each_start(rest: Build, walking: Walking) -> None:
+def test_score_looks_at_the_types_of_each_start(make_validation: Build, walking: Walking) -> None:
     """Walkers who miss each other by 0.6 m; the radius is 0.2 + 0.2 theta."""
-    callback = rest()
+    callback = make_validation()
     callback.begin([labelled([0.3], theta=theta) for theta in (1.0, 4.0, 1.5, 3.0)])
     found = callback.consider(Trainer(), walking(straight))
     assert found is not None
@@ -139,7 +141,8 @@ def test_score_looks_at_the_types_of_each_start(rest: Build, walking: Walking) -
 
 def test_safety_comes_first_then_cost() -> None:
     order = [Score(0.0, -0.1), Score(0.0, 0.2), Score(0.0, math.inf), Score(0.1, -5.0), Score(1.0, -9.0)]
-    assert sorted(reversed(order)) == order
+    for place, found in enumerate(order):
+        assert [found.after(other) is not None for other in order] == [place <= k for k in range(len(order))]
 
 
 def test_one_broken_episode_collides_and_does_not_spoil_the_median() -> None:
@@ -155,8 +158,8 @@ def test_one_broken_episode_collides_and_does_not_spoil_the_median() -> None:
     assert score(played._replace(clearance=touching), starts).collision_rate == pytest.approx(0.2)
 
 
-def test_a_policy_that_is_not_a_number_collides(rest: Build, walking: Walking) -> None:
-    callback, trainer = rest(), Trainer()
+def test_a_policy_that_is_not_a_number_collides(make_validation: Build, walking: Walking) -> None:
+    callback, trainer = make_validation(), Trainer()
     callback.begin([labelled([SAFE] * 3)])
     found = callback.consider(trainer, walking(nowhere))
     assert found is not None
@@ -169,13 +172,13 @@ def test_a_policy_that_is_not_a_number_collides(rest: Build, walking: Walking) -
 
 @pytest.mark.parametrize("name", GAMES)
 @pytest.mark.parametrize("value", [torch.nan, torch.inf, 1e30])
-def test_weights_that_diverged_collide_without_an_error(rest: Build, name: str, value: float) -> None:
+def test_weights_that_diverged_collide_without_an_error(make_validation: Build, name: str, value: float) -> None:
     game = make(name)
     operator = operators.get("hno")(game, width=8, depth=1)
     with torch.no_grad():
         for weights in operator.net.parameters():
             weights.fill_(value)
-    callback = rest(dt=0.1)
+    callback = make_validation(dt=0.1)
     callback.begin([fake_labels(game, (1.0, 5.0), 3)])
     found = callback.consider(Trainer(), operator)
     assert found is not None
@@ -186,14 +189,14 @@ def test_weights_that_diverged_collide_without_an_error(rest: Build, name: str, 
 
 @pytest.mark.parametrize("name", GAMES)
 @pytest.mark.parametrize("exact", [False, True])
-def test_episodes_are_those_of_the_evaluation(rest: Build, name: str, exact: bool) -> None:
+def test_episodes_are_those_of_the_evaluation(make_validation: Build, name: str, exact: bool) -> None:
     """The same policy, starts and collisions as in the table of an evaluated checkpoint."""
     torch.manual_seed(0)
     game = make(name)
     operator = operators.get("hno")(game, width=8, depth=1, exact_terminal=exact)
     start = game.initial_box.sample(12, torch.Generator().manual_seed(0))
     labels = [fake_labels(game, (1.0, 5.0), 12, start=start), fake_labels(game, (2.0, 2.0), 12, seed=1, start=start)]
-    callback = rest(dt=0.1, probe=12)
+    callback = make_validation(dt=0.1, probe=12)
     callback.begin(labels)
     found = callback.consider(Trainer(), operator)
     rows = collision_table(game, OperatorPolicy(operator.eval().requires_grad_(False)), labels, [], dt=0.1)
@@ -218,9 +221,9 @@ def episodes(monkeypatch: pytest.MonkeyPatch) -> list[Tensor]:
 
 
 def test_all_starts_are_played_only_where_the_first_ones_are_safe(
-    rest: Build, walking: Walking, episodes: list[Tensor]
+    make_validation: Build, walking: Walking, episodes: list[Tensor]
 ) -> None:
-    callback = rest(probe=2)
+    callback = make_validation(probe=2)
     callback.begin([labelled([SAFE, SAFE, SAFE, CLOSE, SAFE]), labelled([SAFE, SAFE, CLOSE], theta=2.0)])
     found = callback.consider(Trainer(), walking(straight))
     assert [len(x0) for x0 in episodes] == [4, 8]
@@ -230,20 +233,30 @@ def test_all_starts_are_played_only_where_the_first_ones_are_safe(
 
 
 def test_where_one_of_the_first_starts_collides_the_others_wait(
-    rest: Build, walking: Walking, episodes: list[Tensor]
+    make_validation: Build, walking: Walking, episodes: list[Tensor]
 ) -> None:
-    callback = rest(probe=2)
-    callback.begin([labelled([SAFE] * 5), labelled([SAFE, CLOSE, SAFE, SAFE], theta=2.0)])
+    """What was not played counts as colliding, so that nobody profits from being stopped early."""
+    callback = make_validation(probe=2)
+    callback.begin([labelled([SAFE] * 11), labelled([SAFE, CLOSE, *[SAFE] * 7], theta=2.0)])
     found = callback.consider(Trainer(), walking(straight))
     assert [len(x0) for x0 in episodes] == [4]
     assert found is not None
-    assert found.collision_rate == 1 / 4
+    assert found.collision_rate == pytest.approx((1 + 16) / 20)
+
+
+def test_few_starts_are_all_played(make_validation: Build, walking: Walking, episodes: list[Tensor]) -> None:
+    callback = make_validation(probe=2)
+    callback.begin([labelled([SAFE] * 4), labelled([SAFE, CLOSE, SAFE, SAFE], theta=2.0)])
+    found = callback.consider(Trainer(), walking(straight))
+    assert [len(x0) for x0 in episodes] == [4, 8]
+    assert found is not None
+    assert found.collision_rate == 1 / 8
 
 
 def test_where_the_first_ones_are_all_they_are_played_once(
-    rest: Build, walking: Walking, episodes: list[Tensor]
+    make_validation: Build, walking: Walking, episodes: list[Tensor]
 ) -> None:
-    callback = rest(probe=3)
+    callback = make_validation(probe=3)
     callback.begin([labelled([SAFE] * 3), labelled([SAFE] * 2, theta=2.0)])
     found = callback.consider(Trainer(), walking(straight))
     assert [len(x0) for x0 in episodes] == [5]
@@ -251,8 +264,8 @@ def test_where_the_first_ones_are_all_they_are_played_once(
     assert found.collision_rate == 0
 
 
-def test_a_validation_without_starts_rests(rest: Build, walking: Walking, tmp_path: Path) -> None:
-    for callback in (rest(), rest()):
+def test_a_validation_without_starts_rests(make_validation: Build, walking: Walking, tmp_path: Path) -> None:
+    for callback in (make_validation(), make_validation()):
         trainer = Trainer()
         assert callback.consider(trainer, walking(straight)) is None
         trainer.global_step = 10
@@ -263,7 +276,7 @@ def test_a_validation_without_starts_rests(rest: Build, walking: Walking, tmp_pa
 
 
 def test_it_plays_every_so_often_and_at_the_end(
-    rest: Build, walking: Walking, monkeypatch: pytest.MonkeyPatch
+    make_validation: Build, walking: Walking, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     steps: list[int] = []
 
@@ -272,7 +285,7 @@ def test_it_plays_every_so_often_and_at_the_end(
         return Score(1.0, 0.0)
 
     monkeypatch.setattr(ClosedLoopValidation, "play", play)
-    callback, operator, trainer = rest(every=4), walking(straight), Trainer(max_steps=10)
+    callback, operator, trainer = make_validation(every=4), walking(straight), Trainer(max_steps=10)
     callback.begin([labelled([SAFE])])
     for trainer.global_step in range(1, 11):
         callback.on_train_batch_end(trainer, operator, None, None, trainer.global_step - 1)
@@ -284,7 +297,7 @@ def test_it_plays_every_so_often_and_at_the_end(
 
 
 def test_best_checkpoint_is_that_of_the_best_score(
-    rest: Build, walking: Walking, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    make_validation: Build, walking: Walking, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """Of equal scores, the last."""
     scores = [
@@ -294,7 +307,7 @@ def test_best_checkpoint_is_that_of_the_best_score(
     ]  # fmt: skip
     kept = [1, 2, 3, 3, 3, 6, 7, 8, 8, 10, 10, 10, 13]
     monkeypatch.setattr(ClosedLoopValidation, "play", lambda self, trainer, *_: scores[trainer.global_step - 1])
-    callback, operator, trainer = rest(every=1), walking(straight), Trainer()
+    callback, operator, trainer = make_validation(every=1), walking(straight), Trainer()
     callback.begin([labelled([SAFE])])
     for number, step in enumerate(kept):
         trainer.global_step = number + 1
@@ -303,9 +316,65 @@ def test_best_checkpoint_is_that_of_the_best_score(
         assert callback.best == scores[step - 1]
 
 
+def kept_scores(callback: ClosedLoopValidation, operator: ValueOperator, found: Sequence[Score]) -> list[Score | None]:
+    """The best score after each of these."""
+    callback.begin([labelled([SAFE])])
+    scores, kept = iter(found), list[Score | None]()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ClosedLoopValidation, "play", lambda self, *_: next(scores))
+        for _ in found:
+            callback.consider(Trainer(), operator)
+            kept.append(callback.best)
+    return kept
+
+
+def test_of_costs_that_differ_by_chance_the_later_is_kept(make_validation: Build, walking: Walking) -> None:
+    """Within a per cent of the equilibria's cost, and among equal shares of collisions only."""
+    scores = [
+        Score(0.1, 0.2),
+        Score(0.1, 0.209),
+        Score(0.1, 0.25),
+        Score(0.2, 0.209),
+        Score(0.05, 9.0),
+        Score(0.05, 9.009),
+    ]
+    kept = kept_scores(make_validation(), walking(straight), scores)
+    assert kept == [scores[k] for k in (0, 0, 0, 0, 4, 4)]
+    assert scores[1].after(scores[0]) == scores[0]
+    assert scores[2].after(scores[0]) is None
+
+
+def test_costs_do_not_creep_up_by_chance(make_validation: Build, walking: Walking) -> None:
+    kept = kept_scores(make_validation(), walking(straight), [Score(0.0, 0.1 + 0.009 * k) for k in range(30)])
+    assert all(best is not None and best.excess <= 0.1 + 0.02 for best in kept)
+
+
+def test_a_policy_that_collides_wherever_another_one_does_and_more_is_not_better(
+    make_validation: Build, walking: Walking
+) -> None:
+    """The first one is safe from the first starts, so that all are played: 3 of 5 collide. The second one collides
+    from one of two first starts, and would from 4 of 5."""
+
+    high: list[Tensor] = []
+
+    def worse(x: Tensor) -> Tensor:
+        """Whoever starts highest walks down, into the other one's way."""
+        if not x[..., 0].any():
+            high.append(x[:, :1, 1:] > 0.87)
+        return torch.where(high[-1], torch.tensor([4.0, -1.8]), straight(x))
+
+    callback, trainer = make_validation(probe=2), Trainer()
+    callback.begin([labelled([SAFE, 0.8, CLOSE, CLOSE, CLOSE])])
+    first = callback.consider(trainer, walking(straight))
+    assert first is not None
+    assert first.collision_rate == pytest.approx(3 / 5)
+    callback.consider(trainer, walking(worse))
+    assert callback.best == first
+
+
 @pytest.mark.parametrize("stop", [False, True])
-def test_training_ends_once_it_is_safe_if_asked(rest: Build, walking: Walking, stop: bool) -> None:
-    callback, trainer = rest(stop=stop, every=1, probe=1), Trainer()
+def test_training_ends_once_it_is_safe_if_asked(make_validation: Build, walking: Walking, stop: bool) -> None:
+    callback, trainer = make_validation(stop=stop, every=1, probe=1), Trainer()
     callback.begin([labelled([SAFE, CLOSE])])
     trainer.global_step = 1
     callback.on_train_batch_end(trainer, walking(straight), None, None, 0)
@@ -316,42 +385,40 @@ def test_training_ends_once_it_is_safe_if_asked(rest: Build, walking: Walking, s
     assert trainer.should_stop == stop
 
 
-def test_what_was_found_is_logged(rest: Build, walking: Walking, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_was_found_is_logged(make_validation: Build, walking: Walking, monkeypatch: pytest.MonkeyPatch) -> None:
     told: list[dict[str, float]] = []
-    operator, trainer, callback = walking(straight), Trainer(), rest(every=1)
+    operator, trainer, callback = walking(straight), Trainer(), make_validation(every=1)
     monkeypatch.setattr(ValueOperator, "log_dict", lambda self, values, **kwargs: told.append(values))
     callback.begin([labelled([SAFE, CLOSE], excess=0.5)])
     callback.on_train_batch_end(trainer, operator, None, None, 0)
-    assert told == [
-        {"closed_loop/collision_rate": 0.5, "closed_loop/excess": pytest.approx(0.5, abs=1e-3)}
-    ]
+    assert told == [{"closed_loop/collision_rate": 0.5, "closed_loop/excess": pytest.approx(0.5, abs=1e-3)}]
     assert 0 < callback.seconds < 60
 
 
-def test_data_are_told_where_the_first_starts_led(rest: Build, walking: Walking, tmp_path: Path) -> None:
+def test_data_are_told_where_the_first_starts_led(make_validation: Build, walking: Walking, tmp_path: Path) -> None:
     arguments = {"types": [(1.0, 1.0)], "trajectories": 2, "cache": tmp_path, "seed": 0}
     sizes = {"bvp": 4, "interior": 4, "terminal": 4}
     data = GameData(
         Walkers(), {"interior"}, batch_sizes=sizes, curriculum=Curriculum(0, 0), shares={"rollout": 1.0}, **arguments
     )
-    callback = rest(probe=2, dt=0.1)
+    callback = make_validation(probe=2, dt=0.1)
     callback.begin([labelled([SAFE, 0.7, 0.5])])
     callback.consider(Trainer(datamodule=data), walking(straight))
-    assert data.visited is not None
-    times, states = data.visited
+    assert data.visits
+    _, times, states = data.visits[-1]
     assert times.shape == (2 * 11,)
     torch.testing.assert_close(states[..., 0], 4 * (1 - times).unsqueeze(-1).expand(-1, 2))
     assert set(states[..., 1].flatten().tolist()) == {torch.tensor(SAFE).item(), torch.tensor(0.7).item()}
     callback.consider(Trainer(datamodule=data), walking(away))
-    torch.testing.assert_close(data.visited[1][..., 0], -4 * (1 - times).unsqueeze(-1).expand(-1, 2))
+    torch.testing.assert_close(data.visits[-1].x[..., 0], -4 * (1 - times).unsqueeze(-1).expand(-1, 2))
     assert callback.consider(Trainer(datamodule=object()), walking(away)) is not None
 
 
-def test_the_best_score_survives_a_checkpoint(rest: Build, walking: Walking, tmp_path: Path) -> None:
-    first = rest()
+def test_the_best_score_survives_a_checkpoint(make_validation: Build, walking: Walking, tmp_path: Path) -> None:
+    first = make_validation()
     first.begin([labelled([SAFE, CLOSE])])
     first.consider(Trainer(), walking(away))
-    resumed = rest()
+    resumed = make_validation()
     resumed.load_state_dict(first.state_dict())
     assert resumed.best == first.best
     assert isinstance(resumed.best, Score)
@@ -362,12 +429,14 @@ def test_the_best_score_survives_a_checkpoint(rest: Build, walking: Walking, tmp
     assert (tmp_path / BEST).read_text() == "0", "worse than before the interruption"
 
 
-def test_a_best_score_without_its_checkpoint_is_forgotten(rest: Build, walking: Walking, tmp_path: Path) -> None:
-    first = rest()
+def test_a_best_score_without_its_checkpoint_is_forgotten(
+    make_validation: Build, walking: Walking, tmp_path: Path
+) -> None:
+    first = make_validation()
     first.begin([labelled([SAFE, CLOSE])])
     first.consider(Trainer(), walking(away))
     (tmp_path / BEST).unlink()
-    resumed = rest()
+    resumed = make_validation()
     resumed.load_state_dict(first.state_dict())
     assert resumed.best is None
     resumed.begin([labelled([SAFE, CLOSE])])
@@ -375,9 +444,9 @@ def test_a_best_score_without_its_checkpoint_is_forgotten(rest: Build, walking: 
     assert (tmp_path / BEST).exists()
 
 
-def test_a_state_without_a_score_is_one_too(rest: Build) -> None:
-    callback = rest()
-    callback.load_state_dict(rest().state_dict())
+def test_a_state_without_a_score_is_one_too(make_validation: Build) -> None:
+    callback = make_validation()
+    callback.load_state_dict(make_validation().state_dict())
     assert callback.best is None
 
 
@@ -390,31 +459,28 @@ def test_starts_keep_the_order_of_their_labels() -> None:
     torch.testing.assert_close(starts.cost, -whole.value[:, 0].sum(-1).float())
 
 
-@pytest.mark.xfail(raises=RuntimeError, reason="starts stay float32: trainer.precision=64-true fails", strict=True)
-def test_an_operator_in_double_precision_is_validated(rest: Build) -> None:
+def test_an_operator_in_double_precision_is_validated(make_validation: Build) -> None:
     game = make("narrow_road")
     operator = operators.get("hno")(game, width=8, depth=1).double()
-    callback = rest(dt=0.1)
+    callback = make_validation(dt=0.1)
     callback.begin([fake_labels(game, (1.0, 5.0), 3)])
     assert callback.consider(Trainer(), operator) is not None
 
 
-@pytest.mark.xfail(reason="starts stay on the CPU: training on any other device fails", strict=True)
-def test_starts_go_to_the_device_of_the_operator(rest: Build, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_starts_go_to_the_device_of_the_operator(make_validation: Build, monkeypatch: pytest.MonkeyPatch) -> None:
     devices: list[str] = []
 
-    class Seen(Exception):
+    class SeenError(Exception):
         pass
 
     def look(game: Game, policy: object, x0: Tensor, theta: Tensor, *others: object) -> Trajectory:
         devices.extend((x0.device.type, theta.device.type))
-        raise Seen
+        raise SeenError
 
     monkeypatch.setattr(module, "rollout", look)
-    game = make("narrow_road")
-    operator = operators.get("hno")(game, width=8, depth=1).to("meta")
-    callback = rest()
-    callback.begin([fake_labels(game, (1.0, 5.0), 3)])
-    with pytest.raises(Seen):
+    operator = operators.get("hno")(make("narrow_road"), width=8, depth=1).to("meta")
+    callback = make_validation()
+    callback.begin([fake_labels(make("narrow_road"), (1.0, 5.0), 3)])
+    with pytest.raises(SeenError):
         callback.consider(Trainer(), operator)
     assert devices == ["meta", "meta"]

@@ -10,8 +10,8 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from hno.operators.base import distinct_types, ego_views, tables
 from hno.operators.checkpoint import CheckpointError, check_resumable, load_operator
+from hno.operators.inputs import distinct_types, ego_views, tables
 from hno.types import Field, Labels, Points, Sample, Types
 from tests.operators.conftest import ACTIVATIONS, GAMES, MakeOperator, random_points
 
@@ -110,10 +110,7 @@ def test_an_exact_end_travels_with_the_checkpoint(make_operator: MakeOperator, t
         check_resumable(tmp_path / "last.ckpt", make_operator("lane_change"))
 
 
-LOST = pytest.mark.xfail(reason="in inference mode the terminal costate is lost without a word")
-
-
-@pytest.mark.parametrize("quiet", [torch.no_grad, pytest.param(torch.inference_mode, marks=LOST)])
+@pytest.mark.parametrize("quiet", [torch.no_grad, torch.inference_mode])
 def test_an_exact_end_needs_no_gradients_from_outside(
     make_operator: MakeOperator, quiet: Callable[[], AbstractContextManager[None]]
 ) -> None:

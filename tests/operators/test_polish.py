@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from hno.operators import ValueOperator
-from hno.operators.base import distinct_types
+from hno.operators.inputs import distinct_types
 from hno.operators.polish import polish
 from hno.types import Batch, Labels, Sample
 from tests.operators.conftest import ACTIVATIONS, MakeOperator, random_points

@@ -14,7 +14,7 @@ from hno.losses import hji_residual
 from hno.operators import ValueOperator, activations
 from hno.operators import value_gradient as module
 from hno.operators.deeponet import DeepONet
-from hno.operators.value_gradient import Layer, value_gradient
+from hno.operators.value_gradient import Kernels, Layer, compiled, value_gradient
 from hno.types import Batch, Field, Labels, Points, Sample
 from tests.operators.conftest import ACTIVATIONS, GAMES, MakeOperator, random_points
 
@@ -47,7 +47,7 @@ def problem(rows: int = 23, inputs: int = 4, widths: Sequence[int] = (7, 5, 6), 
     layers = [Layer(normal(b, a, scale=a**-0.5).requires_grad_(), normal(b).requires_grad_()) for a, b in sizes]
     return Problem(
         normal(rows, inputs),
-        torch.arange(rows).flip(0) % max(1, table - 1),
+        torch.randint(table - 1, (rows,), generator=generator),
         normal(table, widths[-1]).requires_grad_(),
         layers,
         normal(rows),
@@ -73,8 +73,8 @@ def derivatives(at: Problem, value: Tensor, gradient: Tensor) -> list[Tensor]:
     return [torch.zeros_like(leaf) if d is None else d for leaf, d in zip(at.leaves, found, strict=True)]
 
 
-def by_hand(activation: str, at: Problem) -> tuple[Tensor, Tensor]:
-    return value_gradient(activations.get(activation), at.y, at.which, at.coefficient, at.layers)
+def by_hand(activation: str, at: Problem, kernels: Kernels | None = None) -> tuple[Tensor, Tensor]:
+    return value_gradient(activations.get(activation), at.y, at.which, at.coefficient, at.layers, kernels)
 
 
 @pytest.mark.parametrize("activation", ACTIVATIONS)
@@ -158,6 +158,34 @@ def test_the_backward_pass_can_run_twice(activation: str) -> None:
     assert all(map(torch.equal, first, torch.autograd.grad(total, at.leaves)))
 
 
+@pytest.mark.parametrize("activation", ["tanh", "sin"])
+def test_second_derivatives_are_refused_or_right(activation: str) -> None:
+    at = problem()
+    found = []
+    for results in (by_hand, plainly):
+        value, gradient = results(activation, at)
+        total = value.square().sum() + gradient.square().sum()
+        (slope,) = torch.autograd.grad(total, at.layers[0].weight, create_graph=True)
+        try:
+            found.append(torch.autograd.grad(slope.square().sum(), at.leaves))
+        except RuntimeError:
+            return
+    for ours, theirs in zip(*found, strict=True):
+        torch.testing.assert_close(ours, theirs, **TIGHT)
+
+
+@pytest.mark.parametrize("activation", ACTIVATIONS)
+def test_mixed_precision_trains(make_operator: MakeOperator, activation: str) -> None:
+    operator = make_operator(activation=activation)
+    points = random_points(operator.game, 40)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        field = operator.field(points)
+        loss = torch.stack([part.float().abs().mean() for part in field]).sum()
+    slopes = torch.autograd.grad(loss, list(operator.net.parameters()), allow_unused=True)
+    assert all(slope.dtype == torch.float32 and bool(slope.isfinite().all()) for slope in slopes if slope is not None)
+    assert bool(slopes[1].any())
+
+
 @pytest.mark.parametrize("activation", ACTIVATIONS)
 @pytest.mark.parametrize("block", [1, 5, 23, 24])
 @pytest.mark.parametrize("kept", [0, 22, 23])
@@ -233,7 +261,7 @@ def test_beyond_the_limit_one_block_at_a_time_is_computed_again(watch: Watch, mo
 
 def test_nothing_is_kept_where_no_gradient_is_needed(watch: Watch) -> None:
     at = problem(20)
-    frozen = problem(20)._replace(
+    frozen = at._replace(
         coefficient=at.coefficient.detach(), layers=[Layer(*(part.detach() for part in layer)) for layer in at.layers]
     )
     found = watch(lambda: by_hand("tanh", frozen))
@@ -251,6 +279,50 @@ def test_a_policy_keeps_nothing(watch: Watch, make_operator: MakeOperator, quiet
         found = watch(lambda: operator.field(points))
     assert found.forwards == 10
     assert found.alive <= 1
+
+
+@pytest.fixture
+def quickly(monkeypatch: pytest.MonkeyPatch) -> list[Callable[..., Any]]:
+    """Trace functions as `torch.compile` does, but generate no code; what was traced."""
+    original, traced = torch.compile, list[Callable[..., Any]]()
+
+    def trace(function: Callable[..., Any]) -> Callable[..., Any]:
+        traced.append(function)
+        return original(function, backend="eager")
+
+    torch.compiler.reset()
+    monkeypatch.setattr(torch, "compile", trace)
+    return traced
+
+
+def test_compiled_kernels_change_nothing(quickly: list[Callable[..., Any]], monkeypatch: pytest.MonkeyPatch) -> None:
+    """In place in the sums too, whatever the activation and the number of rows."""
+    kernels = compiled.__wrapped__()
+    assert kernels is not None
+    assert quickly == [module._forward, module._backward]
+    monkeypatch.setattr(module, "CPU_BLOCK", 9)
+    for activation, rows, kept in (("tanh", 18, 18), ("sin", 18, 0)):
+        monkeypatch.setattr(module, "KEPT", kept)
+        at = problem(rows)
+        found, expected = by_hand(activation, at, kernels), plainly(activation, at)
+        pairs = zip((*found, *derivatives(at, *found)), (*expected, *derivatives(at, *expected)), strict=True)
+        for ours, theirs in pairs:
+            torch.testing.assert_close(ours, theirs, **TIGHT)
+
+
+@pytest.mark.parametrize("error", [RuntimeError("no compiler\nat all"), OSError("no disk"), ImportError("no triton")])
+def test_without_a_compiler_nothing_is_compiled(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, error: Exception
+) -> None:
+    def fail(*arguments: Any) -> None:
+        raise error
+
+    monkeypatch.setattr(torch, "compile", lambda function: fail)
+    with caplog.at_level("WARNING"):
+        assert compiled.__wrapped__() is None
+    (record,) = caplog.records
+    assert str(error).splitlines()[0] in record.getMessage()
+    assert "at all" not in record.getMessage()
 
 
 @pytest.mark.parametrize("activation", ACTIVATIONS)

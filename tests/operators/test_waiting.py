@@ -8,7 +8,7 @@ import pytest
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from hno.operators import ValueOperator
-from hno.operators.base import distinct_types
+from hno.operators.inputs import distinct_types
 from hno.types import Batch
 from tests.operators.conftest import GAMES, MakeOperator
 from tests.operators.test_training import random_batch
