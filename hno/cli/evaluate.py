@@ -43,7 +43,7 @@ def evaluate(config: DictConfig) -> bool:
     """
     send_lightning_to_hydra()
     if OmegaConf.is_missing(config, "checkpoint"):
-        log.error("Say which checkpoint to evaluate: python evaluate.py checkpoint=<path to last.ckpt>")
+        log.error("Say which checkpoint to evaluate: python evaluate.py checkpoint=<path to best.ckpt>")
         return False
     folder = Path(HydraConfig.get().runtime.output_dir)
     results = Results(folder / "results.json", {"checkpoint": config.checkpoint, "config_hash": config_hash(config)})
