@@ -67,7 +67,7 @@ SUITES = {
     "noise": Suite(GRID5, 40, disturbance=Disturbance(noise=0.2)),
     "delay": Suite(GRID5, 40, disturbance=Disturbance(delay=1)),
 }
-FEWER = {"drone": 0.5}
+FEWER = {"drone": 0.3}
 """Share of the starts above that a game gets, because most of its starts collide inevitably."""
 MOST = {"half types": 256, "beyond": 512, "1.5 x box": 256, "2 x box": 256}
 """Start states of a type after which the search for safe ones ends, where it is not 4096."""
