@@ -145,7 +145,7 @@ def validation_labels(config: DictConfig, data: GameData, results: Results) -> l
     found = data.held_out()
     if choice.types is not None:
         types = parse_types(data.game, choice.types)
-        requests = [Request(theta, choice.starts, config.seed, "validation") for theta in types]
+        requests = [Request(theta, choice.starts, choice.seed, "validation") for theta in types]
         found, seconds = safe_labels_for(
             data.game, requests, data.cache, config.data.workers, label_progress(), clearance=clearance
         )
