@@ -122,7 +122,7 @@ def test_validation_starts_of_chosen_types(command: Command, monkeypatch: pytest
         (("validation=grid5", "validation.starts=-2"), "validation.starts must be a positive whole number; got -2"),
         (("validation=grid5", "validation.starts=many"), "validation.starts must be a positive whole number"),
         (("validation=grid7",), "Did you mean 'grid5'?"),
-        (("validation.stop=true",), "Known: starts, stop_when_safe, types"),
+        (("validation.stop=true",), "Known: seed, starts, stop_when_safe, types"),
         (("loss.hardest=0",), "loss.hardest is a share in (0, 1]; got 0"),
         (("loss.hardest=1.5",), "loss.hardest is a share in (0, 1]; got 1.5"),
         (("sampler.rollout=-1",), "Sampler shares must be nonnegative numbers for box, band, labels, rollout"),
