@@ -2,158 +2,57 @@
 
     python benchmarks/recipes.py --set hypothesis --games lane_change --seeds 0 1 2
 
-Sets of recipes are in `RECIPES`; `--recipe "name: overrides"` adds one. Runs that are there are not repeated: each
-keeps its results in `outputs/recipes/<set>/<game>/<recipe>/<seed>/`. Recipes are chosen on validation starts
-(`--suites validation`); the other suites use test starts. All of them count starts whose equilibrium keeps 2 cm.
-Prints a table per game, with counts pooled over seeds and 95 % intervals, and as its last line one JSON object.
+Sets of recipes are in recipe_sets.py; `--recipe "name: overrides"` adds one. Runs that are there with the same
+configuration are not repeated: each keeps its results in `outputs/recipes/<set>/<game>/<recipe>/<seed>/`. Recipes are
+chosen on validation starts (`--suites validation`); the other suites use test starts. All of them count starts whose
+equilibrium keeps 2 cm. Prints a table per game, with counts pooled over seeds and 95 % intervals, and as its last line
+one JSON object.
 """
 
 from __future__ import annotations
 
 import argparse
-import itertools
 import json
 import logging
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
+from recipe_sets import FEWER, MOST, RECIPES, SUITES
 from rich.console import Console
 from rich.table import Table
 
 from hno.cli.config import config_dir
-from hno.cli.results import Results
+from hno.cli.results import Results, config_hash
 from hno.cli.train import fit
 from hno.data.labels import Request, default_cache, safe_labels_for
 from hno.data.trust import safe
 from hno.evaluation.metrics import clopper_pearson
-from hno.evaluation.rollout import Disturbance, rollout
+from hno.evaluation.rollout import rollout
 from hno.evaluation.validation import Starts, starts_of
 from hno.games import make
 from hno.operators.checkpoint import OperatorPolicy, load_policy
 from hno.types import part
 
-GRID5 = [(float(a), float(b)) for a, b in itertools.product(range(1, 6), repeat=2)]
-GRID9 = [(a / 2, b / 2) for a, b in itertools.product(range(2, 11), repeat=2)]
-BEYOND = [(1.0, 6.0), (3.0, 6.0), (5.0, 6.0), (5.5, 5.5), (6.0, 6.0)]
-
-
-class Suite(NamedTuple):
-    """Episodes that recipes are compared on."""
-
-    types: Sequence[tuple[float, float]]
-    """Player types."""
-    starts: int
-    """Safe starts per type."""
-    widen: float = 1.0
-    """Width of the start box in units of the game's."""
-    split: str = "test"
-    """Of the starts."""
-    disturbance: Disturbance = Disturbance()
-    """Of the controls."""
-
-
-SUITES = {
-    "validation": Suite(GRID5, 200, split="validation"),
-    "integer types": Suite(GRID5, 200),
-    "half types": Suite(GRID9, 20),
-    "beyond": Suite(BEYOND, 60),
-    "1.5 x box": Suite(GRID5, 40, widen=1.5),
-    "2 x box": Suite(GRID5, 40, widen=2.0),
-    "noise": Suite(GRID5, 40, disturbance=Disturbance(noise=0.2)),
-    "delay": Suite(GRID5, 40, disturbance=Disturbance(delay=1)),
-}
-FEWER = {"drone": 0.3}
-"""Share of the starts above that a game gets, because most of its starts collide inevitably."""
-MOST = {"half types": 256, "beyond": 512, "1.5 x box": 256, "2 x box": 256}
-"""Start states of a type after which the search for safe ones ends, where it is not 4096."""
-
-CORNERS = "data.types=[[1,1],[1,5],[5,1],[5,5]]"
-STEPS = "trainer.max_steps=1000 optimizer.lr=1e-2"
-SHORT = f"operator=sno {STEPS}"
-FIFTEEN = str([[a, b] for a, b in itertools.combinations_with_replacement(range(1, 6), 2)]).replace(" ", "")
-TEN = f"{STEPS} {CORNERS} data.trajectories=10"
-ANY = f"{STEPS} {CORNERS} operator=hno data.interior_types=box data.trajectories=200"
-RECIPES: dict[str, dict[str, str]] = {
-    "default": {"sno": "operator=sno", "hno": "operator=hno"},
-    "hypothesis": {
-        "sno": f"{STEPS} operator=sno",
-        "hno": f"{STEPS} operator=hno",
-        "sno, time of hno": f"{STEPS} trainer.max_steps=1250 operator=sno",
-        "sno, corners": f"{STEPS} {CORNERS} operator=sno data.trajectories=200",
-        "hno, corners": f"{STEPS} {CORNERS} operator=hno data.trajectories=200",
-        "sno, corners, 50": f"{STEPS} {CORNERS} operator=sno data.trajectories=50",
-        "hno, corners, 50": f"{STEPS} {CORNERS} operator=hno data.trajectories=50",
-    },
-    "activations": {
-        f"{name} {rate}": f"operator=sno activation={name} optimizer.lr={rate} trainer.max_steps=1000"
-        for name, rate in itertools.product(("tanh", "relu", "sin", "sin activation.frequency=10"), (1e-3, 3e-3, 1e-2))
-    },
-    "optimizers": {
-        "soap 1e-2": SHORT,
-        "soap 3e-3": f"{SHORT} optimizer.lr=3e-3",
-        "soap 1e-2, polish": f"{SHORT} trainer.polish=100",
-        "soap 1e-2, linear": f"{SHORT} optimizer.schedule=linear",
-        "soap 1e-2, clip 1": f"{SHORT} trainer.gradient_clip_val=1.0",
-        "adam 3e-3": f"{SHORT} optimizer=adam optimizer.lr=3e-3",
-        "adam 1e-2": f"{SHORT} optimizer=adam optimizer.lr=1e-2",
-        "adamw 1e-2": f"{SHORT} optimizer=adamw optimizer.lr=1e-2",
-        "muon 2e-2": f"{SHORT} optimizer=muon optimizer.lr=2e-2",
-    },
-    "losses": {
-        "huber": f"{SHORT} loss.norm=huber",
-        "l2": f"{SHORT} loss.norm=l2",
-        "free terminal value": f"{SHORT} operator.exact_terminal=false",
-        "balance": f"{SHORT} loss.balance=true",
-        "costate 3": f"{SHORT} loss.weights.costate=3",
-        "physical units": f"{SHORT} loss.scaled=false",
-        "batch 1024, twice the steps": f"{SHORT} data.batch_sizes.bvp=1024 trainer.max_steps=2000",
-        "batch 4096, half the steps": f"{SHORT} data.batch_sizes.bvp=4096 trainer.max_steps=500",
-    },
-    "samplers": {
-        "mixed": f"{SHORT} operator=hno",
-        "uniform": f"{SHORT} operator=hno sampler=uniform",
-        "band": f"{SHORT} operator=hno sampler=band",
-        "labels": f"{SHORT} operator=hno sampler=labels",
-        "rollout": f"{SHORT} operator=hno sampler=rollout",
-        "hardest quarter": f"{SHORT} operator=hno loss.hardest=0.25",
-    },
-    "types": {
-        "4 types x 280": f"{SHORT} {CORNERS} data.trajectories=280",
-        "7 types x 160": SHORT,
-        "15 types x 75": f"{SHORT} data.trajectories=75 data.types={FIFTEEN}",
-    },
-    "ten labels": {
-        "sno": f"{TEN} operator=sno",
-        "hno 0.02": f"{TEN} operator=hno",
-        "hno 0.1": f"{TEN} operator=hno loss.weights.residual=0.1",
-        "hno 0.1, around labels": f"{TEN} operator=hno loss.weights.residual=0.1 sampler=labels",
-        "hno 0.002": f"{TEN} operator=hno loss.weights.residual=0.002",
-    },
-    "any type": {
-        "0.1": f"{ANY} loss.weights.residual=0.1",
-        "0.01": f"{ANY} loss.weights.residual=0.01",
-        "0.1, around labels": f"{ANY} loss.weights.residual=0.1 sampler=labels",
-        "0.1, rollouts": f"{ANY} loss.weights.residual=0.1 sampler=rollout",
-        "0.1, whole horizon at once": f"{ANY} loss.weights.residual=0.1 data.widening=0",
-    },
-}
-"""Overrides by name, by set."""
+Cases = dict[str, tuple[Starts, list[int]]]
+"""Starts of suites that were loaded, and how many there are of each type."""
 
 
 def run(config: DictConfig, folder: Path) -> dict[str, Any]:
     """Train one recipe, or read what is there."""
-    path = folder / "results.json"
+    path, key = folder / "results.json", config_hash(config)
     if path.exists():
         content = json.loads(path.read_text())
-        if content["status"] == "trained":
+        if content["status"] == "trained" and content.get("config_hash") == key:
             return content
     folder.mkdir(parents=True, exist_ok=True)
-    results = Results(path, {"game": config.game.name, "operator": config.operator.name, "seed": config.seed})
+    (folder / "suites.json").unlink(missing_ok=True)
+    head = {"game": config.game.name, "operator": config.operator.name, "seed": config.seed, "config_hash": key}
+    results = Results(path, head)
     try:
         fit(config, folder, results)
         results.update(status="trained")
@@ -190,9 +89,7 @@ def play(policy: OperatorPolicy, suite: str, at: Starts, sizes: Sequence[int]) -
     }
 
 
-def evaluate(
-    folder: Path, game: str, suites: Sequence[str], cases: dict[str, tuple[Starts, list[int]]]
-) -> dict[str, Any]:
+def evaluate(folder: Path, game: str, suites: Sequence[str], cases: Cases) -> dict[str, Any]:
     """Every suite for one trained run; what was evaluated before is read."""
     path = folder / "suites.json"
     found = json.loads(path.read_text()) if path.exists() else {}
@@ -231,8 +128,34 @@ def cell(found: dict[str, Any]) -> str:
     return f"{rate:.2f} % ({100 * low:.2f} to {100 * high:.2f}) of {found['starts']}, {100 * found['excess']:+.1f} %"
 
 
-def main() -> None:
-    """Train, evaluate, print."""
+def compared(
+    game: str, name: str, overrides: str, arguments: argparse.Namespace, cases: Cases
+) -> dict[str, Any] | None:
+    """One recipe over the seeds: medians, and every suite pooled; None if no seed could be trained."""
+    rows = []
+    for seed in arguments.seeds:
+        with initialize_config_dir(str(config_dir()), version_base=None):
+            fixed = [f"game={game}", f"seed={seed}", f"trainer.threads={arguments.threads}", "logger=csv"]
+            config = compose("train", overrides=[*fixed, *overrides.split()])
+        folder = arguments.out / arguments.set / game / name / str(seed)
+        content = run(config, folder)
+        if content["status"] != "trained":
+            print(f"{game} {name} seed {seed} failed: {content['reason']}")
+            continue
+        suites = evaluate(folder, game, arguments.suites, cases)
+        rows.append({"seconds": content["seconds"], "metrics": content["metrics"], "suites": suites})
+    if not rows:
+        return None
+    return {
+        "seconds": float(torch.tensor([row["seconds"]["training"] for row in rows]).median()),
+        "costate_error": float(torch.tensor([row["metrics"]["val/costate_error"] for row in rows]).median()),
+        "seeds": len(rows),
+        "suites": {suite: pooled(rows, suite) for suite in arguments.suites},
+    }
+
+
+def options() -> argparse.Namespace:
+    """What the command line asks for."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--set", default="adhoc", help=f"one of {', '.join(RECIPES)}, or a name for --recipe's")
     parser.add_argument("--games", nargs="+", default=["narrow_road", "lane_change", "drone"])
@@ -242,44 +165,38 @@ def main() -> None:
     parser.add_argument("--suites", nargs="*", default=["validation"], choices=sorted(SUITES))
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--out", type=Path, default=Path("outputs/recipes"))
-    arguments = parser.parse_args()
-    logging.basicConfig(level=logging.ERROR)
+    return parser.parse_args()
+
+
+def chosen(arguments: argparse.Namespace) -> dict[str, str]:
+    """Overrides by the names of the recipes that are asked for."""
+    recipes = RECIPES.get(arguments.set, {}) | dict(map(str.strip, text.split(":", 1)) for text in arguments.recipe)
+    missing = [name for name in arguments.only or recipes if name not in recipes]
+    if missing or not recipes:
+        known = ", ".join(recipes) or f"none; sets are {', '.join(RECIPES)}"
+        raise SystemExit(f"No recipe {', '.join(missing)} in {arguments.set!r}. Known: {known}.")
+    return {name: text for name, text in recipes.items() if not arguments.only or name in arguments.only}
+
+
+def main() -> None:
+    """Train, evaluate, print."""
+    arguments = options()
+    recipes = chosen(arguments)
     for name in ("lightning.pytorch", "lightning.pytorch.utilities.rank_zero", "lightning.fabric"):
         logging.getLogger(name).setLevel(logging.ERROR)
     warnings.filterwarnings("ignore", module="lightning.*|torch.*")
     torch.set_num_threads(arguments.threads)
-    recipes = RECIPES.get(arguments.set, {}) | dict(map(str.strip, text.split(":", 1)) for text in arguments.recipe)
-    recipes = {name: text for name, text in recipes.items() if not arguments.only or name in arguments.only}
     console, everything = Console(width=60 + 50 * len(arguments.suites)), {}
     for game in arguments.games:
-        cases: dict[str, tuple[Starts, list[int]]] = {}
+        cases: Cases = {}
         table = Table("recipe", "seconds", "costates", *arguments.suites, title=game)
         for name, overrides in recipes.items():
-            rows = []
-            for seed in arguments.seeds:
-                with initialize_config_dir(str(config_dir()), version_base=None):
-                    fixed = [f"game={game}", f"seed={seed}", f"trainer.threads={arguments.threads}", "logger=csv"]
-                    config = compose("train", overrides=[*fixed, *overrides.split()])
-                folder = arguments.out / arguments.set / game / name / str(seed)
-                content = run(config, folder)
-                if content["status"] == "trained":
-                    suites = evaluate(folder, game, arguments.suites, cases)
-                    rows.append({"seconds": content["seconds"], "metrics": content["metrics"], "suites": suites})
-                else:
-                    console.print(f"{game} {name} seed {seed} failed: {content['reason']}")
-            if rows:
-                found = {suite: pooled(rows, suite) for suite in arguments.suites}
-                seconds = float(torch.tensor([row["seconds"]["training"] for row in rows]).median())
-                costate = float(torch.tensor([row["metrics"]["val/costate_error"] for row in rows]).median())
-                table.add_row(name, f"{seconds:.0f}", f"{costate:.3f}", *(cell(part) for part in found.values()))
-                worst = {suite: [part["worst_type"], part["worst_rate"]] for suite, part in found.items()}
-                console.print(game, name, f"{seconds:.0f} s", *(cell(part) for part in found.values()), worst)
-                everything[f"{game}/{name}"] = {
-                    "seconds": seconds,
-                    "costate_error": costate,
-                    "seeds": len(rows),
-                    **found,
-                }
+            found = compared(game, name, overrides, arguments, cases)
+            if found is not None:
+                cells = f"{found['seconds']:.0f}", f"{found['costate_error']:.3f}", *map(cell, found["suites"].values())
+                table.add_row(name, *cells)
+                print(f"{game}, {name}:", " | ".join(cells), flush=True)
+                everything[f"{game}/{name}"] = found
         console.print(table)
     print(json.dumps(everything))
 

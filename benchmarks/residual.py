@@ -17,8 +17,8 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from hno.data.datamodule import rows_of
 from hno.data.labels import Request, default_cache, labels_for
+from hno.data.rows import rows_of
 from hno.data.sampling import sample_states
 from hno.games import Game
 from hno.losses import Scales

@@ -45,7 +45,7 @@ def main() -> None:
 
 
 def train(config: DictConfig) -> bool:
-    """One run; its folder gets last.ckpt, metrics and results.json.
+    """One run; its folder gets best.ckpt, last.ckpt, metrics and results.json.
 
     Returns:
         Whether it succeeded. A failure has been logged and is in results.json.

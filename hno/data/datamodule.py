@@ -17,10 +17,11 @@ from torch.utils.data import DataLoader, Dataset, IterableDataset
 from hno.data.curriculum import Curriculum
 from hno.data.exchange import read_own
 from hno.data.labels import Report, Request, labels_for
+from hno.data.rows import rows_of
 from hno.data.sampling import check_shares, sample_states
 from hno.games import Game
 from hno.pontryagin.solve import Solver
-from hno.types import Batch, Extremal, Labels, Points, Sample, Status, Trajectory, Types, part
+from hno.types import Batch, Extremal, Sample, Trajectory, Types, part
 
 BOX_TYPES = 32
 """Types that one batch of collocation points draws from the type box: the branch runs once for each."""
@@ -35,35 +36,6 @@ class Visit(NamedTuple):
     """Times to go, (L,)."""
     x: Tensor
     """States, (L, P, n)."""
-
-
-class NoLabelsError(RuntimeError):
-    """Not a single label could be solved."""
-
-
-def rows_of(game: Game, extremals: Sequence[Extremal]) -> Sample:
-    """Every node of every converged trajectory, one per row, float32.
-
-    Raises:
-        NoLabelsError: none converged.
-    """
-    good = [e.status == Status.CONVERGED for e in extremals]
-    if not any(bool(mask.any()) for mask in good):
-        raise NoLabelsError(
-            f"None of {sum(len(mask) for mask in good)} boundary value problems of {type(game).__name__} converged, "
-            "so there is nothing to learn from. Check the game with hno.games.testing.check_game."
-        )
-    columns = zip(*(_columns(game, e, mask) for e, mask in zip(extremals, good, strict=True)), strict=True)
-    tau, x, theta, value, costate = (torch.cat(column).float() for column in columns)
-    distinct, which = theta.unique(dim=0, return_inverse=True)
-    return Sample(Points(tau, x, theta), Labels(value, costate), Types(distinct, which))
-
-
-def _columns(game: Game, found: Extremal, good: Tensor) -> tuple[Tensor, ...]:
-    count, nodes = int(good.sum()), len(found.t)
-    tau = (game.horizon - found.t).expand(count, -1)
-    theta = found.theta[good].unsqueeze(1).expand(-1, nodes, -1)
-    return tuple(part.flatten(0, 1) for part in (tau, found.x[good], theta, found.value[good], found.costate[good]))
 
 
 class GameData(L.LightningDataModule):

@@ -68,7 +68,7 @@ def make_optimizer(name: str, steps: int, lr: float, schedule: str, final_lr: fl
         raise UnknownNameError(unknown_name("optimizer", name, sorted(OPTIMIZERS)))
     if schedule not in SCHEDULES:
         raise UnknownNameError(unknown_name("schedule", schedule, list(SCHEDULES)))
-    known = sorted(set(inspect.signature(OPTIMIZERS[name]).parameters) - {"params", "lr", "kwargs"})
+    known = sorted(set(inspect.signature(OPTIMIZERS[name]).parameters) - {"params", "parameters", "lr", "kwargs"})
     for option in options:
         if option not in known:
             raise UnknownNameError(unknown_name(f"option of {name}", option, known))

@@ -162,7 +162,8 @@ def _backward(
         du = curved[k].addcmul_(dh, block.firsts[k])
         sums[2 * k].addmm_(du.mT, block.inputs[k])
         sums[2 * k + 1].add_(du.sum(0))
-        dh = du @ layers[k].weight
+        if k > 0:
+            dh = du @ layers[k].weight
     return dcoefficient
 
 
@@ -176,7 +177,7 @@ def compiled() -> Kernels | None:
         value, gradient = value_gradient(activations.get("tanh"), y, which, coefficient, layers, kernels)
         (value.sum() + gradient.sum()).backward()
     except (RuntimeError, OSError, ImportError) as error:
-        log.warning("torch.compile does not work here, so nothing is compiled: %s", str(error).splitlines()[0])
+        log.warning("torch.compile does not work here, so nothing is compiled: %s", str(error).partition("\n")[0])
         return None
     return kernels
 

@@ -11,8 +11,9 @@ from torch import Tensor
 
 from hno.data import GameData
 from hno.data.curriculum import Curriculum
-from hno.data.datamodule import BOX_TYPES, NoLabelsError, rows_of
+from hno.data.datamodule import BOX_TYPES
 from hno.data.exchange import write_own
+from hno.data.rows import NoLabelsError, rows_of
 from hno.games import make
 from hno.types import Batch, Status
 from tests.data.conftest import TYPES, MakeData

@@ -220,48 +220,34 @@ def episodes(monkeypatch: pytest.MonkeyPatch) -> list[Tensor]:
     return seen
 
 
-def test_all_starts_are_played_only_where_the_first_ones_are_safe(
-    make_validation: Build, walking: Walking, episodes: list[Tensor]
-) -> None:
-    callback = make_validation(probe=2)
-    callback.begin([labelled([SAFE, SAFE, SAFE, CLOSE, SAFE]), labelled([SAFE, SAFE, CLOSE], theta=2.0)])
-    found = callback.consider(Trainer(), walking(straight))
-    assert [len(x0) for x0 in episodes] == [4, 8]
-    assert bool((episodes[0][..., 1] == SAFE).all())
-    assert found is not None
-    assert found.collision_rate == 2 / 8
-
-
-def test_where_one_of_the_first_starts_collides_the_others_wait(
-    make_validation: Build, walking: Walking, episodes: list[Tensor]
+@pytest.mark.parametrize(
+    ("probe", "first", "second", "played", "rate"),
+    [
+        (2, [SAFE, SAFE, SAFE, CLOSE, SAFE], [SAFE, SAFE, CLOSE], [4, 8], 2 / 8),
+        (2, [SAFE] * 4, [SAFE, CLOSE, SAFE, SAFE], [4, 8], 1 / 8),
+        (2, [SAFE] * 11, [SAFE, CLOSE, *[SAFE] * 7], [4], (1 + 16) / 20),
+        (3, [SAFE] * 3, [SAFE] * 2, [5], 0),
+    ],
+    ids=["the first ones are safe", "there are few", "a first one collides among many", "the first ones are all"],
+)
+def test_first_starts_are_played_first_and_all_unless_they_collide(
+    make_validation: Build,
+    walking: Walking,
+    episodes: list[Tensor],
+    probe: int,
+    first: list[float],
+    second: list[float],
+    played: list[int],
+    rate: float,
 ) -> None:
     """What was not played counts as colliding, so that nobody profits from being stopped early."""
-    callback = make_validation(probe=2)
-    callback.begin([labelled([SAFE] * 11), labelled([SAFE, CLOSE, *[SAFE] * 7], theta=2.0)])
+    callback = make_validation(probe=probe)
+    callback.begin([labelled(first), labelled(second, theta=2.0)])
     found = callback.consider(Trainer(), walking(straight))
-    assert [len(x0) for x0 in episodes] == [4]
+    assert [len(x0) for x0 in episodes] == played
+    assert episodes[0][:, 0, 1].tolist() == pytest.approx([*first[:probe], *second[:probe]])
     assert found is not None
-    assert found.collision_rate == pytest.approx((1 + 16) / 20)
-
-
-def test_few_starts_are_all_played(make_validation: Build, walking: Walking, episodes: list[Tensor]) -> None:
-    callback = make_validation(probe=2)
-    callback.begin([labelled([SAFE] * 4), labelled([SAFE, CLOSE, SAFE, SAFE], theta=2.0)])
-    found = callback.consider(Trainer(), walking(straight))
-    assert [len(x0) for x0 in episodes] == [4, 8]
-    assert found is not None
-    assert found.collision_rate == 1 / 8
-
-
-def test_where_the_first_ones_are_all_they_are_played_once(
-    make_validation: Build, walking: Walking, episodes: list[Tensor]
-) -> None:
-    callback = make_validation(probe=3)
-    callback.begin([labelled([SAFE] * 3), labelled([SAFE] * 2, theta=2.0)])
-    found = callback.consider(Trainer(), walking(straight))
-    assert [len(x0) for x0 in episodes] == [5]
-    assert found is not None
-    assert found.collision_rate == 0
+    assert found.collision_rate == pytest.approx(rate)
 
 
 def test_a_validation_without_starts_rests(make_validation: Build, walking: Walking, tmp_path: Path) -> None:
