@@ -220,9 +220,14 @@ class ValueOperator(L.LightningModule, abc.ABC):
         if stream != "interior" or self.hardest == 1:
             return sample
         with torch.no_grad():
-            residual = self._residual("residual", sample, self.field(sample.points, sample.types))
-        count = max(1, round(self.hardest * len(residual)))
-        return sample.rows(residual.abs().amax(-1).topk(count).indices)
+            field = self.field(sample.points, sample.types)
+            found = [self._residual(name, sample, field).abs().flatten(1).amax(-1) for name in self._weighted(stream)]
+        worst = torch.stack(found).amax(0)
+        return sample.rows(worst.topk(max(1, round(self.hardest * len(worst)))).indices)
+
+    def _weighted(self, stream: str) -> list[str]:
+        """Names of the terms that read a stream and have a weight."""
+        return [name for name, term in self.terms.items() if term.stream == stream and self.weights.get(name, 0) > 0]
 
     def _balanced(self, name: str, loss: Tensor) -> Tensor:
         """A term, divided by its running mean if terms are balanced."""

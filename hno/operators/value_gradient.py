@@ -80,8 +80,8 @@ def value_gradient(
     """
     flat, dtype = [part for layer in layers for part in layer], layers[0].weight.dtype
     y, coefficient = y.to(dtype), coefficient.to(dtype)
-    both = kernels or Kernels(_forward, _backward)
-    value, gradient = _ValueGradient.apply(both, activation, y, which, coefficient, *flat)  # type: ignore[no-untyped-call]
+    arguments = kernels or Kernels(_forward, _backward), activation, y, which, coefficient, *flat
+    value, gradient = _ValueGradient.apply(*arguments)  # type: ignore[no-untyped-call]  # torch does not annotate it
     return value, gradient
 
 
