@@ -6,7 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from hno.cli.summary import percent, show, verdict
+from hno.cli.summary import show, verdict
+from hno.cli.tables import percent
 from hno.evaluation.closed_loop import TypeRow, classify, collision_table
 from hno.evaluation.rollout import Disturbance
 from hno.types import Extremal, Status
