@@ -82,7 +82,8 @@ def remarks(table: Sequence[Mapping[str, Any]], clearance: float) -> list[str]:
     """Which types have no rate and why, and which lie outside the game's range."""
     said = [
         f"No rate (n/a) at ({types(row['theta'])}): of {row['starts']} starts none has an equilibrium that keeps "
-        f"{100 * clearance:g} cm; {row['unsolved']} unsolved, {row['inevitable']} inevitable, {row['marginal']} marginal."
+        f"{100 * clearance:g} cm; {row['unsolved']} unsolved, {row['inevitable']} inevitable, {row['marginal']} "
+        "marginal."
         for row in table
         if row["rate"] is None
     ]

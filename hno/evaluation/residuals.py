@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import torch
@@ -17,8 +17,9 @@ from hno.losses.hji import HJIResidual
 from hno.operators import ValueOperator
 from hno.types import Extremal, Points, Sample, Status
 
-REGIONS = ("start box", "PDE box", "constraint band", "along labels")
-"""Uniform starts at the beginning; uniform in the PDE box; near the surface constraint = 0; nodes of labels."""
+REGIONS = ("start box", "PDE box", "constraint band", "around labels", "along labels")
+"""Uniform starts at the beginning; uniform in the PDE box; near the surface constraint = 0; nodes of labels with noise,
+as the sampler of collocation points makes them (`hno.data.sampling`); the nodes themselves."""
 BINS = 4
 """Equal parts of the horizon by which residuals are reported."""
 
@@ -33,7 +34,7 @@ class ResidualRow(NamedTuple):
     region: str
     """One of `REGIONS`."""
     points: int
-    """How many points; 0 along labels of which none converged."""
+    """How many points; 0 at labels of which none converged."""
     physical: float | None
     """Mean over points and players of the residual's absolute value, 1/s."""
     scaled: float | None
@@ -69,16 +70,23 @@ def residual_table(
 
 
 def _regions(game: Game, found: Extremal, size: int, seed: int) -> Iterator[Points]:
-    """Points of each of `REGIONS`."""
+    """Points of each of `REGIONS`, each from the same seed."""
     types = found.theta[:1].float().expand(size, -1)
-    generator = torch.Generator().manual_seed(seed)
-    yield Points(torch.full((size,), game.horizon), game.initial_box.sample(size, generator), types)
-    for source in ("box", "band"):
-        yield sample_states(game, types, {source: 1.0}, {}, 1.0, generator)
+
+    def sampled(source: str, pools: Mapping[str, tuple[Tensor, Tensor]]) -> Points:
+        return sample_states(game, types, {source: 1.0}, pools, 1.0, torch.Generator().manual_seed(seed))
+
+    starts = game.initial_box.sample(size, torch.Generator().manual_seed(seed))
+    yield Points(torch.full((size,), game.horizon), starts, types)
+    yield sampled("box", {})
+    yield sampled("band", {})
     if bool((found.status == Status.CONVERGED).any()):
-        yield rows_of(game, [found]).points
+        nodes = rows_of(game, [found]).points
+        yield sampled("labels", {"labels": (nodes.tau, nodes.x)})
+        yield nodes
     else:
-        yield Points(types[:0, 0], found.x[:0, 0].float(), types[:0])
+        nothing = Points(types[:0, 0], found.x[:0, 0].float(), types[:0])
+        yield from (nothing, nothing)
 
 
 def _row(
