@@ -100,10 +100,9 @@ def _row(
     horizon = operator.game.horizon
     place = (where.tau / horizon * bins).long().clamp(0, bins - 1)
     physical, scaled = BinnedMean(bins), BinnedMean(bins)
-    if len(where.tau) > 0:
-        residual, scale = hji(operator, where)
-        physical.update(residual, place)
-        scaled.update(residual / scale, place)
+    residual, scale = hji(operator, where) if len(where.tau) > 0 else (where.theta, where.theta)
+    physical.update(residual, place)
+    scaled.update(residual / scale, place)
     return ResidualRow(
         theta=theta,
         seen=theta in seen,
