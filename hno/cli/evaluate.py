@@ -86,10 +86,11 @@ def _run(config: DictConfig, results: Results) -> None:
         log.info("evaluation of %s", path)
         found = assess(policy, labels, config, results) if models else evaluate_policy(policy, labels, config, results)
         outcomes.append(found.collided)
-        sections = run_sections(policy, labels, config, results)
         table = [row._asdict() for row in found.table]
-        models.append({"checkpoint": path, **policy.operator.names(), "table": table, **sections})
-    results.update(**models[0])
+        models.append({"checkpoint": path, **policy.operator.names(), "table": table})
+        for name, content in run_sections(policy, labels, config, results):
+            models[-1][name] = content
+            results.update(**models[0])
     if len(models) > 1:
         results.update(models=models, comparison=comparison(paths, types, outcomes))
     results.update(status="finished")

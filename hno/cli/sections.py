@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 from omegaconf import DictConfig, OmegaConf
@@ -73,12 +73,11 @@ def check_sections(game: Game, settings: DictConfig) -> None:
 
 def run_sections(
     policy: OperatorPolicy, labels: Sequence[Extremal], settings: DictConfig, results: Results
-) -> dict[str, Any]:
-    """Content of the sections that are switched on."""
-    content = {}
+) -> Iterator[tuple[str, Any]]:
+    """Name and content of every section that is switched on, one after the other."""
     for name, section in SECTIONS.items():
         if settings[name]:
             began = time.perf_counter()
-            content[name] = section.compute(policy, labels, settings)
+            content = section.compute(policy, labels, settings)
             results.time(name, time.perf_counter() - began)
-    return content
+            yield name, content

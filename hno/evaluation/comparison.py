@@ -102,8 +102,6 @@ def tango(first: int, second: int, pairs: int, confidence: float = 0.95) -> tupl
 def _upper(b: int, c: int, n: int, z: float) -> float:
     """The difference above (c - b) / n whose score is -z."""
     estimate = (c - b) / n
-    if estimate == 1:
-        return 1.0
 
     def excess(delta: float) -> float:
         """Squared score minus z^2, times the variance, which vanishes at the ends."""

@@ -117,10 +117,10 @@ def test_quantiles_saturation_and_own_costs_are_of_safe_starts() -> None:
     found = labelled(heights, [0.5] * 21 + [-1.0])
 
     def fast(tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
-        """Both at full speed along x; the first one at full speed across for as long as it is in the last tenth."""
+        """Both at full speed along x, the first one also across in the last tenth; who is not safe stands still."""
         u = torch.tensor([6.0, 0.0]).repeat(len(x), 2, 1)
         u[tau < 0.11, 0, 1] = 6.0
-        return u
+        return u * (x[:, 1:, 1:] > 0.1)
 
     (row,) = collision_table(Walkers(), fast, [found], seen=[], dt=0.1)
     assert row.distance_quantiles == pytest.approx((1.02, 1.1, 1.2), abs=2e-3)

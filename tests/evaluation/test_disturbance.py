@@ -89,6 +89,7 @@ def test_numbers_are_standard_normal() -> None:
 def test_a_push_moves_what_is_free_by_its_size_over_the_horizon(kind: str, dt: float) -> None:
     """Standing walkers end where the push leads them; white noise of any step has the same size."""
     game = Walkers().double()
+    game.horizon = 2.0
     x0, theta = starts(game, 3000)
     played = rollout(game, still, x0, theta, dt, substeps=1, points=1, disturbance=Disturbance(**{kind: 0.1}))
     moved = (played.x[:, -1] - x0) / game.state_box.width

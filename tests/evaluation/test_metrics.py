@@ -99,9 +99,10 @@ def test_updates_may_be_split(name: str, size: int) -> None:
 
 @pytest.mark.parametrize("name", METRICS)
 def test_processes_add_up(name: str) -> None:
-    """`merge_state` reduces as processes do."""
+    """`merge_state` reduces as processes do, by the reduction that every state has."""
     build, arguments = METRICS[name]
     first, second = build(), build()
+    assert all(first._reductions.values())
     first.update(*(column[:15] for column in arguments))
     second.update(*(column[15:] for column in arguments))
     first.merge_state(second)
