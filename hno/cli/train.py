@@ -91,7 +91,7 @@ def _run(config: DictConfig, folder: Path, results: Results) -> None:
     policy = load_policy(folder / results.content["checkpoint"])
     types = list(dict.fromkeys([*policy.operator.seen_types, *unseen]))
     test = solve_tests(game, types, settings, cache_folder(config.data.cache), config.data.workers, results)
-    table = evaluate_policy(policy, test, settings, results)
+    table = evaluate_policy(policy, test, settings, results).table
     for logger in trainer.loggers:
         logger.log_metrics(totals(table), step=trainer.global_step)
     results.update(status="finished")
