@@ -16,6 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 from hno.cli.build import cache_folder
 from hno.cli.config import run_command
 from hno.cli.logs import label_progress, send_lightning_to_hydra
+from hno.cli.online import online_section, show_online
 from hno.cli.results import Results, config_hash
 from hno.cli.summary import report, show
 from hno.data.labels import Request, labels_for, safe_labels_for
@@ -57,6 +58,8 @@ def evaluate(config: DictConfig) -> bool:
         results.update(status="failed", reason="interrupted")
         raise
     show(results.content, folder)
+    if "online" in results.content:
+        show_online(results.content["online"])
     return True
 
 
@@ -69,6 +72,10 @@ def _run(config: DictConfig, results: Results) -> None:
     cache = cache_folder(config.cache)
     labels = solve_tests(policy.game, types, config, cache, config.workers, results)
     evaluate_policy(policy, labels, config, results)
+    if config.online > 0:
+        began = time.perf_counter()
+        results.update(online=online_section(policy, labels, config))
+        results.time("online", time.perf_counter() - began)
     results.update(status="finished")
 
 
@@ -135,7 +142,14 @@ def draw(policy: OperatorPolicy, found: Extremal, path: Path, dt: float, episode
 
 def check_evaluation(game: Game, settings: DictConfig) -> None:
     """Raise ValueError for entries that make no evaluation of the game."""
-    for name, least in (("starts", 1), ("seed", 0), ("workers", 1), ("delay", 0)):
+    for name, least in (
+        ("starts", 1),
+        ("seed", 0),
+        ("workers", 1),
+        ("delay", 0),
+        ("online", 0),
+        ("online_interval", 1),
+    ):
         value = settings.get(name)
         if value is not None and not (isinstance(value, int) and value >= least):
             raise ValueError(f"{name} must be a whole number of at least {least}; got {value!r}.")

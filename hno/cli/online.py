@@ -1,0 +1,90 @@
+"""The part of an evaluation that solves the game while it is played, beside the learned policy."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from omegaconf import DictConfig
+from rich.console import Console
+from rich.table import Table
+
+from hno.cli.summary import WIDTH, number, percent
+from hno.evaluation.receding_horizon import RecedingHorizon
+from hno.evaluation.rollout import Disturbance
+from hno.evaluation.yardstick import compare, latency, safe_starts
+from hno.operators.checkpoint import OperatorPolicy
+from hno.types import Extremal
+
+log = logging.getLogger(__name__)
+
+COLUMNS = ("theta", "controller", "starts", "collisions", "rate", "95 % interval", "excess cost", "solves")
+NAMES = {"policy": "learned", "solver": "solved online"}
+
+
+def online_section(policy: OperatorPolicy, labels: Sequence[Extremal], settings: DictConfig) -> dict[str, Any]:
+    """Drive `settings.online` safe starts per type with both controllers; JSON content."""
+    types = [tuple(map(float, found.theta[0])) for found in labels]
+    chosen = safe_starts(labels, settings.online, settings.clearance)
+    total, interval, dt = sum(len(found.status) for found in chosen), settings.online_interval, settings.dt
+    section = {"starts_per_type": settings.online, "interval": interval, "dt": dt, "table": [], "latency": None}
+    if total == 0:
+        return section | {"reason": "no start has a safe equilibrium"}
+    log.info("Playing %d starts by solving the rest of the game every %g s.", total, interval * dt)
+    disturbance = Disturbance(settings.noise, settings.delay, settings.seed)
+    table = compare(policy.game, policy, chosen, types, interval, dt, disturbance)
+    spent = {
+        "policy": latency(policy.game, lambda: policy, chosen, dt=dt),
+        "solver": latency(policy.game, lambda: RecedingHorizon(policy.game, interval), chosen, interval, dt),
+    }
+    return section | {
+        "table": [{name: _plain(value) for name, value in row._asdict().items()} for row in table],
+        "latency": {name: part._asdict() | {"rate": part.rate} for name, part in spent.items()},
+        "reason": None,
+    }
+
+
+def _plain(value: Any) -> Any:
+    return value._asdict() if hasattr(value, "_asdict") else value
+
+
+def show_online(section: Mapping[str, Any]) -> None:
+    """Print both controllers' rows and their latencies."""
+    console = Console(width=None if sys.stdout.isatty() else WIDTH)
+    if section["latency"] is None:
+        console.print(f"Solved online: n/a ({section['reason']}).")
+        return
+    every = 1000 * section["interval"] * section["dt"]
+    caption = "excess cost: above the equilibrium's joint cost, median; solves: in all / searched anew / failed"
+    table = Table(*COLUMNS, title=f"The rest of the game solved every {every:g} ms", caption=caption)
+    for row in section["table"]:
+        for name in NAMES:
+            table.add_row(*_cells(row, name), end_section=name == "solver")
+    console.print(table)
+    for name, spent in section["latency"].items():
+        console.print(f"{NAMES[name]}: {_latency(spent)}", soft_wrap=True)
+
+
+def _cells(row: Mapping[str, Any], name: str) -> list[str]:
+    driven, solves = row[name], row["solves"]
+    interval = driven["interval"]
+    return [
+        "all" if row["theta"] is None else ", ".join(f"{t:g}" for t in row["theta"]),
+        NAMES[name],
+        str(driven["starts"]),
+        str(driven["collisions"]) if driven["starts"] else "n/a",
+        percent(driven["rate"]),
+        "n/a" if interval is None else f"{100 * interval[0]:.2f} to {100 * interval[1]:.2f} %",
+        number(driven["median_excess_cost"]),
+        f"{solves['solves']} / {solves['searches']} / {solves['failures']}" if name == "solver" else "",
+    ]
+
+
+def _latency(spent: Mapping[str, Any]) -> str:
+    return (
+        f"{1000 * spent['median']:.2f} ms an answer (95 %: {1000 * spent['slow']:.2f} ms), {spent['rate']:.1f} Hz; "
+        f"the first one {1000 * spent['first']:.0f} ms; one game on one thread, {spent['answers']} answers in "
+        f"{spent['episodes']} episodes"
+    )
