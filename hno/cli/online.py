@@ -83,8 +83,13 @@ def _cells(row: Mapping[str, Any], name: str) -> list[str]:
 
 
 def _latency(spent: Mapping[str, Any]) -> str:
-    return (
-        f"{1000 * spent['median']:.2f} ms an answer (95 %: {1000 * spent['slow']:.2f} ms), {spent['rate']:.1f} Hz; "
-        f"the first one {1000 * spent['first']:.0f} ms; one game on one thread, {spent['answers']} answers in "
-        f"{spent['episodes']} episodes"
-    )
+    played = f"one game on one thread, {spent['answers']} answers in {spent['episodes']} episodes"
+    first = f"the first answer takes {_milliseconds(spent['first'])}"
+    if spent["median"] is None:
+        return f"{first}, and there is no other; {played}"
+    middle, slow, busy = (_milliseconds(spent[name]) for name in ("median", "slow", "processor"))
+    return f"{spent['rate']:.1f} Hz, {middle} an answer (95 %: {slow}; processor time {busy}); {first}; {played}"
+
+
+def _milliseconds(seconds: float) -> str:
+    return f"{1000 * seconds:.3g} ms"

@@ -60,23 +60,25 @@ class Beside(NamedTuple):
 
 
 class Latency(NamedTuple):
-    """Seconds from a state to controls of one game, on one thread."""
+    """Time from a state to controls of one game, on one thread; numbers that do not exist are None."""
 
     episodes: int
     """Episodes that were played, one at a time."""
     answers: int
     """Answers that were timed, without the first ones."""
-    first: float
+    first: float | None
     """Median of the first answers, s."""
-    median: float
+    median: float | None
     """Median of the others, s."""
-    slow: float
+    slow: float | None
     """95 % quantile of the others, s."""
+    processor: float | None
+    """Median processor time of the others, s: well below `median` on a machine that is busy with other work."""
 
     @property
-    def rate(self) -> float:
+    def rate(self) -> float | None:
         """Answers per second, from the median, Hz."""
-        return 1 / self.median
+        return 1 / self.median if self.median else None
 
 
 def safe_starts(labels: Sequence[Extremal], count: int, clearance: float) -> list[Extremal]:
@@ -162,28 +164,33 @@ def latency(
     """
     starts, theta = _starts(labels)
     chosen = torch.linspace(0, len(starts) - 1, min(episodes, len(starts))).round().long()
-    first, later = list[float](), list[float]()
+    first, later, processor = list[float](), list[float](), list[float]()
     with one_thread():
         for row in chosen:
             timed = _Timed(make_policy())
             rollout(game, timed, starts[row : row + 1], theta[row : row + 1], dt)
             first.append(timed.seconds[0])
             later += timed.seconds[every::every]
-    spent = torch.tensor(later or first)
-    middle = float(torch.tensor(first).median())
-    return Latency(len(chosen), len(later), middle, float(spent.median()), float(spent.quantile(0.95)))
+            processor += timed.processor[every::every]
+    numbers = (_quantile(part, share) for part, share in ((first, 0.5), (later, 0.5), (later, 0.95), (processor, 0.5)))
+    return Latency(len(chosen), len(later), *numbers)
+
+
+def _quantile(seconds: Sequence[float], share: float) -> float | None:
+    return float(torch.tensor(seconds).quantile(share)) if seconds else None
 
 
 class _Timed:
-    """A policy that notes how long its answers take."""
+    """A policy that notes how long its answers take, on the clock and on the processor."""
 
     def __init__(self, policy: Policy) -> None:
-        self.policy, self.seconds = policy, list[float]()
+        self.policy, self.seconds, self.processor = policy, list[float](), list[float]()
 
     def __call__(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
-        began = time.perf_counter()
+        began, worked = time.perf_counter(), time.process_time()
         u = self.policy(tau, x, theta)
         self.seconds.append(time.perf_counter() - began)
+        self.processor.append(time.process_time() - worked)
         return u
 
 

@@ -104,6 +104,9 @@ def test_latency_is_of_one_game_on_one_thread_and_of_answers_that_count() -> Non
     assert 0.05 <= found.first < 0.2
     assert 0.01 <= found.median <= found.slow
     assert found.median < 0.04
+    assert found.processor < 0.008, "sleep takes no processor time"
     assert found.rate == pytest.approx(1 / found.median)
     assert latency(Walkers(), Slow, labels, dt=0.1, episodes=99).episodes == 7
     assert latency(Walkers(), Slow, labels, dt=0.1, episodes=1).answers == 9
+    alone = latency(Walkers(), Slow, labels, every=99, dt=0.1, episodes=1)
+    assert (alone.answers, alone.median, alone.slow, alone.processor, alone.rate) == (0, None, None, None, None)
