@@ -139,3 +139,12 @@ def test_the_game_itself_is_left_alone():
     assert subgame(game, 1.0).horizon == 1.0
     assert game.horizon == 3.0
     assert game.state_box.lo.dtype == torch.float32
+
+
+def test_states_that_are_not_finite_are_failures():
+    game, theta = Walkers().double(), types(2, 1, 1)
+    x = starts(game, 2)
+    x[1] = torch.nan
+    plan = first_plan(game, x, theta)
+    assert plan.failed.tolist() == [False, True]
+    assert replan(subgame(game, 0.9), x, plan.at).failed.tolist() == [False, True]
