@@ -78,9 +78,10 @@ def _run(config: DictConfig, results: Results) -> None:
     results.update(**policies[0].operator.names())
     check_same_game(paths, [policy.game for policy in policies])
     check_evaluation(game, config)
-    check_sections(game, config)
     chosen = [types_to_evaluate(config.theta, policy, config.unseen) for policy in policies]
     types = list(dict.fromkeys(theta for own in chosen for theta in own))
+    for policy in policies:
+        check_sections(policy, types, config)
     labels = solve_tests(game, types, config, cache_folder(config.cache), config.workers, results)
     models, outcomes = list[dict[str, Any]](), list[Sequence[Tensor]]()
     for path, policy in zip(paths, policies, strict=True):

@@ -10,6 +10,8 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
 from hno.cli.build import cache_folder
+from hno.cli.ntk import check_ntk, ntk_section, show_ntk
+from hno.cli.online import check_online, online_section, show_online
 from hno.cli.results import Results
 from hno.cli.starts import solve_starts
 from hno.cli.tables import show_residuals, show_robustness
@@ -21,6 +23,9 @@ from hno.operators.checkpoint import OperatorPolicy
 from hno.types import Extremal
 
 
+Types = Sequence[tuple[float, ...]]
+
+
 class Section(NamedTuple):
     """A part of an evaluation, switched on by the configuration entry of its name."""
 
@@ -28,7 +33,7 @@ class Section(NamedTuple):
     """(policy, labels of every type, configuration) -> content of results.json."""
     show: Callable[[Any, Console], None]
     """Prints that content."""
-    check: Callable[[Game, DictConfig], object] = lambda game, settings: None
+    check: Callable[[OperatorPolicy, Types, DictConfig], object] = lambda policy, types, settings: None
     """Raises ValueError for entries that make no sense, before anything expensive."""
 
 
@@ -58,17 +63,27 @@ def conditions(game: Game, settings: DictConfig) -> list[Condition]:
 
 SECTIONS: dict[str, Section] = {
     "residuals": Section(residuals, show_residuals),
-    "robustness": Section(robustness, show_robustness, conditions),
+    "robustness": Section(
+        robustness, show_robustness, lambda policy, types, settings: conditions(policy.game, settings)
+    ),
+    "ntk": Section(
+        lambda policy, labels, settings: ntk_section(policy.operator, labels, settings),
+        show_ntk,
+        lambda policy, types, settings: check_ntk(policy.operator, types, settings),
+    ),
+    "online": Section(online_section, show_online),
 }
 
 
-def check_sections(game: Game, settings: DictConfig) -> None:
+def check_sections(policy: OperatorPolicy, types: Types, settings: DictConfig) -> None:
     """Raise ValueError for entries that make no sections."""
-    for name, section in SECTIONS.items():
+    for name in ("residuals", "robustness", "ntk"):
         if not isinstance(settings[name], bool):
             raise ValueError(f"{name} must be true or false; got {settings[name]!r}.")
+    check_online(settings)
+    for name, section in SECTIONS.items():
         if settings[name]:
-            section.check(game, settings)
+            section.check(policy, types, settings)
 
 
 def run_sections(
