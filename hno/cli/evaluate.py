@@ -16,6 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 from hno.cli.build import cache_folder
 from hno.cli.config import run_command
 from hno.cli.logs import label_progress, send_lightning_to_hydra
+from hno.cli.ntk import check_ntk, ntk_section
 from hno.cli.results import Results, config_hash
 from hno.cli.summary import report, show
 from hno.data.labels import Request, labels_for, safe_labels_for
@@ -66,9 +67,14 @@ def _run(config: DictConfig, results: Results) -> None:
     results.update(**operator.names())
     check_evaluation(policy.game, config)
     types = types_to_evaluate(config.theta, policy, config.unseen)
+    check_ntk(operator, types, config)
     cache = cache_folder(config.cache)
     labels = solve_tests(policy.game, types, config, cache, config.workers, results)
     evaluate_policy(policy, labels, config, results)
+    if config.ntk:
+        began = time.perf_counter()
+        results.update(ntk=ntk_section(operator, labels, config))
+        results.time("ntk", time.perf_counter() - began)
     results.update(status="finished")
 
 

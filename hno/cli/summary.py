@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 import hno
+from hno.cli.ntk import ntk_table
 from hno.registry import UnknownNameError
 
 log = logging.getLogger(__name__)
@@ -32,6 +33,8 @@ def show(results: Mapping[str, Any], folder: Path) -> None:
     console = Console(width=None if sys.stdout.isatty() else WIDTH)
     console.print(table)
     console.print(verdict(results["table"]))
+    if "ntk" in results:
+        console.print(ntk_table(results["ntk"]))
     spent = ", ".join(f"{part.replace('_', ' ')} {seconds:.0f} s" for part, seconds in results["seconds"].items())
     console.print(f"Time: {spent}\nResults: {folder / 'results.json'}", soft_wrap=True)
 
