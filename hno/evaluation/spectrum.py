@@ -58,8 +58,8 @@ def spectrum(matrix: Tensor, cutoff: float | None = None) -> Spectrum:
     kept = values[(values > 0) & (values > cutoff * values[0])]
     if len(kept) == 0:
         return Spectrum(values, cutoff, 0, None, None)
-    shares = values.clamp_min(0) / values.clamp_min(0).sum()
-    entropy = torch.special.entr(shares).sum()
+    positive = values.clamp_min(0)
+    entropy = torch.special.entr(positive / positive.sum()).sum()
     return Spectrum(values, cutoff, len(kept), float(kept[0] / kept[-1]), float(entropy.exp()))
 
 

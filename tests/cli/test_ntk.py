@@ -36,7 +36,7 @@ def test_the_kernel_at_training_types_is_in_the_results(command: Command, random
 
 
 def test_no_kernel_unless_asked_for(command: Command, random_checkpoint: Path) -> None:
-    run = command("evaluate", f"checkpoint={random_checkpoint}", "theta=1,1", *FAST)
+    run = command("evaluate", f"checkpoint={random_checkpoint}", "theta=1,2", *FAST)
     assert run.code == 0, run.text
     assert "ntk" not in run.results
     assert "tangent" not in run.text
