@@ -10,7 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
 from hno.cli.build import cache_folder
-from hno.cli.ntk import check_ntk, ntk_section, show_ntk
+from hno.cli.ntk import check_ntk, ntk_section, ntk_table
 from hno.cli.online import check_online, online_section, show_online
 from hno.cli.results import Results
 from hno.cli.starts import solve_starts
@@ -21,7 +21,6 @@ from hno.evaluation.rollout import Disturbance
 from hno.games import Game
 from hno.operators.checkpoint import OperatorPolicy
 from hno.types import Extremal
-
 
 Types = Sequence[tuple[float, ...]]
 
@@ -68,7 +67,7 @@ SECTIONS: dict[str, Section] = {
     ),
     "ntk": Section(
         lambda policy, labels, settings: ntk_section(policy.operator, labels, settings),
-        show_ntk,
+        lambda section, console: console.print(ntk_table(section)),
         lambda policy, types, settings: check_ntk(policy.operator, types, settings),
     ),
     "online": Section(online_section, show_online),

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 from omegaconf import OmegaConf
+from rich.console import Console
 
 from hno.cli.online import online_section, show_online
 from hno.operators.checkpoint import load_policy
@@ -59,5 +60,5 @@ def test_without_a_safe_start_nothing_is_driven(random_checkpoint: Path, capsys:
     )
     section = online_section(policy, [found], settings)
     assert (section["table"], section["latency"]) == ([], None)
-    show_online(section)
+    show_online(section, Console())
     assert "n/a (no start has a safe equilibrium)" in capsys.readouterr().out
