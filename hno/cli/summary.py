@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shlex
 import sys
 import traceback
 from collections.abc import Mapping, Sequence
@@ -15,6 +16,7 @@ from rich.table import Table
 
 import hno
 from hno.registry import UnknownNameError
+from hno.report.totals import totals
 
 log = logging.getLogger(__name__)
 
@@ -24,7 +26,7 @@ WIDTH = 120
 
 
 def show(results: Mapping[str, Any], folder: Path) -> None:
-    """Print the collision table, the totals and where everything lies."""
+    """Print the collision table, the totals, where everything lies and how to see it."""
     title = " / ".join(str(results[name]) for name in ("game", "operator", "activation"))
     table = Table(*COLUMNS, title=title, caption=_caption(results))
     for row in results["table"]:
@@ -33,7 +35,12 @@ def show(results: Mapping[str, Any], folder: Path) -> None:
     console.print(table)
     console.print(verdict(results["table"]))
     spent = ", ".join(f"{part.replace('_', ' ')} {seconds:.0f} s" for part, seconds in results["seconds"].items())
-    console.print(f"Time: {spent}\nResults: {folder / 'results.json'}", soft_wrap=True)
+    console.print(f"Time: {spent}\nResults: {folder / 'results.json'}\n{where(folder)}", soft_wrap=True)
+
+
+def where(folder: Path) -> str:
+    """How to see a run or a sweep."""
+    return f"Page: python -m hno.report {shlex.quote(str(folder))}"
 
 
 def _caption(results: Mapping[str, Any]) -> str:
@@ -70,14 +77,12 @@ def number(value: float | None) -> str:
 
 def verdict(table: Sequence[Mapping[str, Any]]) -> str:
     """The totals over all types in one sentence."""
-    safe = sum(row["safe_starts"] for row in table)
-    if safe == 0:
+    whole = totals(table)
+    if whole.rate is None or whole.worst_theta is None:
         return "No start has a safe equilibrium: there is no collision rate (n/a)."
-    collisions = sum(row["collisions"] for row in table)
-    worst = max((row for row in table if row["rate"] is not None), key=lambda row: row["rate"])
-    at = ", ".join(f"{t:g}" for t in worst["theta"])
-    total = f"{collisions} collisions in {safe} safe starts ({percent(collisions / safe)})"
-    return f"{total}; worst {percent(worst['rate'])} at ({at})."
+    at = ", ".join(f"{t:g}" for t in whole.worst_theta)
+    total = f"{whole.collisions} collisions in {whole.safe_starts} safe starts ({percent(whole.rate)})"
+    return f"{total}; worst {percent(whole.worst_rate)} at ({at})."
 
 
 def report(error: Exception) -> None:
