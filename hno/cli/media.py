@@ -80,7 +80,7 @@ def draw(results: Mapping[str, Any], folder: Path, kinds: Collection[type[Logger
         if not {WandbLogger, TensorBoardLogger}.isdisjoint(kinds):
             made["collision_map"] = folder / "collision_map.png"
             collision_map(results["table"], made["collision_map"], title)
-    except (PlotsMissingError, ValueError) as error:
+    except (PlotsMissingError, OSError, ValueError) as error:
         log.info("No picture for dashboards: %s", error)
     return {name: path for name, path in made.items() if path.exists()}
 
