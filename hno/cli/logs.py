@@ -19,7 +19,6 @@ from lightning.pytorch.callbacks import ProgressBar, RichProgressBar
 from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger, WandbLogger
 from omegaconf import DictConfig, OmegaConf
 
-from hno.cli.results import finite
 from hno.data.labels import Progress, Report
 from hno.registry import UnknownNameError, unknown_name
 
@@ -84,7 +83,7 @@ def _wandb(config: DictConfig, folder: Path) -> Logger | None:
         name=folder.name,
         save_dir=folder,
         mode=mode,
-        config=finite(OmegaConf.to_container(config, resolve=True)),  # W&B loses runs of others
+        config=OmegaConf.to_container(config, resolve=True),
     )
 
 

@@ -84,7 +84,7 @@ def test_a_job_whose_configuration_cannot_be_resolved_fails_alone(command: Comma
     """Adam has no such entry, SOAP has."""
     sweep = f"hydra.sweep.dir={tmp_path}/sweep"
     entry = "trainer.max_steps=${optimizer.precondition_frequency}"
-    run = command("train", "-m", sweep, *SMOKE, entry, "optimizer=adam,soap")
+    run = command("train", "-m", sweep, *SMOKE, entry, "optimizer=adam,soap", "hydra.sweeper.max_batch_size=1")
     assert run.code == 1
     found = [Outcome(0, "", folder).results for folder in sorted((tmp_path / "sweep").glob("[0-9]*"))]
     assert [results["status"] for results in found] == ["failed", "finished"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -41,10 +42,20 @@ class OfflineRun(NamedTuple):
     exit_code: int | None
 
 
+def written(path: Path, seconds: float = 20.0) -> list[Record]:
+    """Records of a run that was finished; W&B's own process may still be writing them."""
+    end = time.monotonic() + seconds
+    while True:
+        found = [Record.FromString(message) for message in messages(path.read_bytes())]
+        if any(record.HasField("exit") for record in found) or time.monotonic() > end:
+            return found
+        time.sleep(0.05)
+
+
 def offline_run(folder: Path) -> OfflineRun:
     """The one offline run of a run folder."""
     (path,) = folder.glob("wandb/offline-run-*/run-*.wandb")
-    found = [Record.FromString(message) for message in messages(path.read_bytes())]
+    found = written(path)
     (run,) = (record.run for record in found if record.HasField("run"))
     history = [
         {item.key or "/".join(item.nested_key): json.loads(item.value_json) for item in record.history.item}

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from matplotlib.animation import FuncAnimation
 from matplotlib.figure import Figure
 from PIL import Image
 
@@ -64,6 +65,21 @@ def test_an_animation_has_a_frame_for_each_time_and_they_differ(dimensions: int,
             frames.append(image.convert("RGB").tobytes())
     assert len(set(frames)) == 4
     assert image.info["duration"] == 500, "as fast as the episode: two frames a second"
+
+
+def test_frames_show_the_time_and_the_paths_so_far(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    seen: list[tuple[str, list[int], list[float]]] = []
+
+    def look(self: Any, *_: object, **__: object) -> None:
+        for frame in self.new_frame_seq():
+            self._func(frame)
+            axes = self._fig.axes[0]
+            lengths = [len(line.get_xdata()) for line in axes.lines]
+            seen.append((self._fig.get_suptitle(), lengths, [disc.radius for disc in axes.patches]))
+
+    monkeypatch.setattr(FuncAnimation, "save", look)
+    animate(episode((1, 5), 0.3, frames=3), tmp_path / "worst.gif", "a game")
+    assert seen == [(f"a game, t = {0.5 * k:.2f} s", [k + 1] * 2, [0.75] * 2) for k in range(3)]
 
 
 def test_without_matplotlib_the_remedy_is_said(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
