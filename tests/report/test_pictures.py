@@ -71,6 +71,7 @@ def test_frames_show_the_time_and_the_paths_so_far(monkeypatch: pytest.MonkeyPat
     seen: list[tuple[str, list[int], list[float]]] = []
 
     def look(self: Any, *_: object, **__: object) -> None:
+        self._draw_was_started = True  # it would warn otherwise
         for frame in self.new_frame_seq():
             self._func(frame)
             axes = self._fig.axes[0]
