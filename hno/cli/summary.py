@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shlex
 import sys
 import traceback
 from collections.abc import Mapping, Sequence
@@ -17,6 +18,7 @@ import hno
 from hno.cli.sections import SECTIONS
 from hno.cli.tables import interval, number, percent, short_names, show_comparison, types
 from hno.registry import UnknownNameError
+from hno.report.totals import totals
 
 log = logging.getLogger(__name__)
 
@@ -29,7 +31,7 @@ WIDTH = 140
 
 
 def show(results: Mapping[str, Any], folder: Path) -> None:
-    """Print the collision table and the sections of every model, the totals and where everything lies."""
+    """Print the tables and the sections of every model, the totals, where everything lies and how to see it."""
     console = Console(width=None if sys.stdout.isatty() else WIDTH)
     models = results.get("models", [results])
     names = short_names([str(model["checkpoint"]) for model in models]) if len(models) > 1 else [""]
@@ -38,7 +40,12 @@ def show(results: Mapping[str, Any], folder: Path) -> None:
     if "comparison" in results:
         show_comparison(results["comparison"], console)
     spent = ", ".join(f"{part.replace('_', ' ')} {seconds:.0f} s" for part, seconds in results["seconds"].items())
-    console.print(f"Time: {spent}\nResults: {folder / 'results.json'}", soft_wrap=True)
+    console.print(f"Time: {spent}\nResults: {folder / 'results.json'}\n{where(folder)}", soft_wrap=True)
+
+
+def where(folder: Path) -> str:
+    """How to see a run or a sweep."""
+    return f"Page: python -m hno.report {shlex.quote(str(folder))}"
 
 
 def _show_model(model: Mapping[str, Any], clearance: float, name: str, console: Console) -> None:
@@ -95,13 +102,11 @@ def remarks(table: Sequence[Mapping[str, Any]], clearance: float) -> list[str]:
 
 def verdict(table: Sequence[Mapping[str, Any]]) -> str:
     """The totals over all types in one sentence."""
-    safe = sum(row["safe_starts"] for row in table)
-    if safe == 0:
+    whole = totals(table)
+    if whole.rate is None or whole.worst_theta is None:
         return "No start has a safe equilibrium: there is no collision rate (n/a)."
-    collisions = sum(row["collisions"] for row in table)
-    worst = max((row for row in table if row["rate"] is not None), key=lambda row: row["rate"])
-    total = f"{collisions} collisions in {safe} safe starts ({percent(collisions / safe)})"
-    return f"{total}; worst {percent(worst['rate'])} at ({types(worst['theta'])})."
+    total = f"{whole.collisions} collisions in {whole.safe_starts} safe starts ({percent(whole.rate)})"
+    return f"{total}; worst {percent(whole.worst_rate)} at ({types(whole.worst_theta)})."
 
 
 def report(error: Exception) -> None:
