@@ -10,7 +10,7 @@ from typing import Any
 
 from lightning.pytorch.loggers import Logger, TensorBoardLogger, WandbLogger
 
-from hno.cli.summary import number
+from hno.cli.tables import number
 from hno.report.collision_map import collision_map
 from hno.report.gif import animate
 from hno.report.picture import PlotsMissingError

@@ -13,7 +13,8 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from hno.cli.summary import percent, where
+from hno.cli.summary import where
+from hno.cli.tables import percent
 from hno.report.totals import totals
 
 NAMES = ("game", "operator", "activation", "seed")
