@@ -1,0 +1,270 @@
+"""Folders of runs and sweeps, as train.py and evaluate.py leave them."""
+
+from __future__ import annotations
+
+import math
+import shlex
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import yaml
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from hno.report.parsing import (
+    Curves,
+    Episode,
+    TypeResult,
+    UnreadableError,
+    curves,
+    episode,
+    flatten,
+    read_json,
+    records,
+    type_result,
+    whole,
+)
+
+T = TypeVar("T")
+
+RESULTS = "results.json"
+SCHEMAS = (1, 2)
+"""Versions of results.json that are known."""
+ENDED = ("finished", "failed")
+"""States of a job that has ended; any other is unfinished."""
+NOT_AVAILABLE = "n/a"
+CONDITIONS = ("clearance", "dt", "widen", "noise", "delay")
+"""Entries of results.json that say under which conditions episodes were played."""
+
+
+class NoRunsError(ValueError):
+    """A folder that holds no run."""
+
+
+class Run(NamedTuple):
+    """One job."""
+
+    name: str
+    """Its folder, relative to the one that was asked for."""
+    status: str
+    reason: str | None
+    """Why it failed."""
+    game: str
+    operator: str
+    activation: str
+    seed: int | None
+    content: Mapping[str, Any]
+    """Everything in results.json."""
+    table: tuple[TypeResult, ...]
+    settings: Mapping[str, str]
+    """The configuration, dotted names."""
+    curves: Curves
+    episodes: tuple[Episode, ...]
+    command: str | None
+    """The command line that repeats it."""
+    notes: tuple[str, ...]
+    """What could not be read, and why."""
+
+    @property
+    def finished(self) -> bool:
+        """Whether it came to its end without failing."""
+        return self.status == "finished"
+
+    @property
+    def conditions(self) -> str:
+        """How episodes were played, equal for runs that may be compared."""
+        return ", ".join(f"{name} {self.content[name]}" for name in CONDITIONS if name in self.content)
+
+
+class Skipped(NamedTuple):
+    """A folder that looks like a run and is none."""
+
+    name: str
+    reason: str
+
+
+class Sweep(NamedTuple):
+    """All runs below a folder."""
+
+    name: str
+    runs: tuple[Run, ...]
+    skipped: tuple[Skipped, ...]
+    command: str | None
+    """The command line of the whole sweep; None for single runs."""
+    planned: int | None
+    """How many jobs it has; None where that is not known."""
+
+
+def load(root: Path) -> Sweep:
+    """Read all runs in a folder and below.
+
+    Raises:
+        NoRunsError: there is none.
+    """
+    if not root.is_dir():
+        raise NoRunsError(f"{root} is not a folder. Give the folder of a run or of a sweep, such as multirun/<date>/<time>.")
+    runs, skipped = [], []
+    for folder in _candidates(root):
+        name = root.resolve().name if folder == root else folder.relative_to(root).as_posix()
+        try:
+            runs.append(read_run(folder, name))
+        except UnreadableError as error:
+            skipped.append(Skipped(name, str(error)))
+    if not runs:
+        found = "; ".join(f"{entry.name}: {entry.reason}" for entry in skipped[:3]) or f"no {RESULTS} in it or below"
+        raise NoRunsError(f"{root} holds no run ({found}). Runs are written by train.py and evaluate.py.")
+    command, planned = _sweep(root / "multirun.yaml")
+    return Sweep(root.resolve().name, tuple(runs), tuple(skipped), command, planned)
+
+
+def _candidates(root: Path) -> list[Path]:
+    """Folders with results, and those where Hydra began a job."""
+    marks = [*root.rglob(RESULTS), *root.rglob(".hydra")]
+    return sorted({mark.parent for mark in marks}, key=_natural)
+
+
+def _natural(path: Path) -> list[tuple[float, str]]:
+    """Sorts 2_drone before 10_drone."""
+    heads = [(part.split("_")[0], part) for part in path.parts]
+    return [(float(head) if head.isdecimal() else math.inf, part) for head, part in heads]
+
+
+def read_run(folder: Path, name: str) -> Run:
+    """One run; parts that cannot be read are left out and noted.
+
+    Raises:
+        UnreadableError: it has no results, or foreign ones.
+    """
+    if not (folder / RESULTS).exists():
+        raise UnreadableError(f"no {RESULTS}: the job has only begun, or ended before it could write any")
+    content = read_json(folder / RESULTS)
+    if not (isinstance(content, dict) and isinstance(content.get("status"), str) and "table" in content):
+        raise UnreadableError(f"{RESULTS} is not hno's: it has no status and table")
+    notes: list[str] = []
+    if content.get("schema") not in SCHEMAS:
+        notes.append(f"{RESULTS} has schema {content.get('schema')!r}; known are {SCHEMAS}")
+    game, operator, activation = (_name(content.get(key)) for key in ("game", "operator", "activation"))
+    return Run(
+        name, content["status"], _text(content.get("reason")), game, operator, activation, whole(content.get("seed")),
+        content,
+        tuple(_each(content["table"], type_result, "row of the table", notes)),
+        _settings(folder, content, notes),
+        _curves(folder / "csv" / "metrics.csv", notes),
+        tuple(_episodes(folder, content, notes)),
+        _command(folder),
+        tuple(notes),
+    )  # fmt: skip
+
+
+def _name(value: Any) -> str:
+    return value if isinstance(value, str) and value else NOT_AVAILABLE
+
+
+def _text(value: Any) -> str | None:
+    return None if value is None else str(value)
+
+
+def _each(entries: Any, parse: Callable[[Any], T], what: str, notes: list[str]) -> list[T]:
+    if not isinstance(entries, list):
+        notes.append(f"expected a list of each {what}; got {type(entries).__name__}")
+        return []
+    found = []
+    for entry in entries:
+        try:
+            found.append(parse(entry))
+        except UnreadableError as error:
+            notes.append(f"a {what} is left out: {error}")
+    return found
+
+
+def _curves(path: Path, notes: list[str]) -> Curves:
+    if not path.exists():
+        return {}
+    try:
+        return curves(path)
+    except UnreadableError as error:
+        notes.append(f"no learning curves: {error}")
+        return {}
+
+
+def _episodes(folder: Path, content: Mapping[str, Any], notes: list[str]) -> list[Episode]:
+    name = content.get("episodes")
+    if not isinstance(name, str):
+        return []
+    path = folder / Path(name).name  # a name inside the folder, whatever the file says
+    try:
+        entries = read_json(path)
+    except UnreadableError as error:
+        notes.append(f"no episodes: {error}")
+        return []
+    return _each(entries.get("episodes") if isinstance(entries, dict) else None, episode, "episode", notes)
+
+
+def _settings(folder: Path, content: Mapping[str, Any], notes: list[str]) -> dict[str, str]:
+    if isinstance(content.get("config"), dict):
+        return flatten(content["config"])
+    try:
+        return flatten(_yaml(folder / ".hydra" / "config.yaml") or {})
+    except UnreadableError as error:
+        notes.append(f"no settings: {error}")
+        return {}
+
+
+def _yaml(path: Path) -> Any:
+    """Content of a YAML file as it is written, interpolations too; None where there is none."""
+    if not path.exists():
+        return None
+    try:
+        return OmegaConf.to_container(OmegaConf.load(path))
+    except (OSError, ValueError, yaml.YAMLError, OmegaConfBaseException) as error:
+        raise UnreadableError(f"{path.name} is not YAML ({str(error).splitlines()[0]:.80})") from error
+
+
+def _command(folder: Path) -> str | None:
+    try:
+        overrides, hydra = (_yaml(folder / ".hydra" / name) for name in ("overrides.yaml", "hydra.yaml"))
+    except UnreadableError:
+        return None
+    return None if not isinstance(overrides, list) else _command_line(hydra, overrides)
+
+
+def _command_line(hydra: Any, arguments: list[Any]) -> str:
+    """What to type; the script is named after Hydra's job."""
+    job = _dig(hydra, "hydra", "job", "name") or "train"
+    return shlex.join(["python", f"{job}.py", *(str(argument) for argument in arguments)])
+
+
+def _dig(content: Any, *keys: str) -> Any:
+    for key in keys:
+        content = content.get(key) if isinstance(content, dict) else None
+    return content
+
+
+def _sweep(path: Path) -> tuple[str | None, int | None]:
+    """The command line of a sweep and how many jobs it has."""
+    try:
+        content = _yaml(path)
+    except UnreadableError:
+        return None, None
+    overrides = _dig(content, "hydra", "overrides", "task")
+    if not isinstance(overrides, list):
+        return None, None
+    return _command_line(content, ["-m", *overrides]), _jobs([str(entry) for entry in overrides])
+
+
+def _jobs(overrides: list[str]) -> int | None:
+    try:
+        parsed = OverridesParser.create().parse_overrides(overrides)
+        return math.prod(
+            len(list(entry.sweep_string_iterator())) if entry.is_sweep_override() else 1 for entry in parsed
+        )
+    except HydraException:
+        return None
+
+
+def label_statistics(run: Run) -> list[Mapping[str, Any]]:
+    """What is known about a run's training labels, one entry per type."""
+    return records(run.content.get("label_statistics"))
