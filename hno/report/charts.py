@@ -26,12 +26,12 @@ def heat_map(data: Any, legend: alt.Legend | None = None) -> alt.LayerChart:
     """Collision rates over the types of two players.
 
     Args:
-        data: rows with theta_1 and theta_2 (as text), shown (rate or one of its bounds, in [0, 1], or null), label, seen, tip.
+        data: rows with theta_1, theta_2, shown (rate or one of its bounds, in [0, 1], or null), label, seen, tip.
         legend: of the colours; none by default.
     """
     base = alt.Chart(data).encode(
-        x=alt.X("theta_1:N", sort=None, title="θ₁", axis=alt.Axis(labelAngle=0, ticks=False, domain=False)),
-        y=alt.Y("theta_2:N", sort=None, title="θ₂", axis=alt.Axis(ticks=False, domain=False, titleAngle=0)),
+        x=alt.X("theta_1:O", title="θ₁", axis=alt.Axis(labelAngle=0, ticks=False, domain=False, offset=2)),
+        y=alt.Y("theta_2:O", sort="descending", title="θ₂", axis=alt.Axis(ticks=False, domain=False, offset=2)),
         tooltip="tip:N",
     )
     scale = alt.Scale(type="log", domain=list(RATES), clamp=True, range="heatmap", interpolate="rgb")
@@ -40,7 +40,7 @@ def heat_map(data: Any, legend: alt.Legend | None = None) -> alt.LayerChart:
     none = cells.mark_rect(cornerRadius=3, fill=alt.expr("zero")).transform_filter("datum.shown === 0")
     nothing = base.mark_rect(cornerRadius=3, fill="transparent", stroke=alt.expr("muted"), strokeDash=[2, 3])
     seen = base.mark_rect(cornerRadius=3, fill=None, stroke=alt.expr("ink"), strokeWidth=2).transform_filter("datum.seen")
-    contrast = "datum.shown > 0 ? (luminance(scale('color', datum.shown)) < 0.3 ? '#fff' : '#111') : muted"
+    contrast = "datum.shown > 0 ? (luminance(scale('color', datum.shown)) < 0.2 ? '#fff' : '#111') : muted"
     text = base.mark_text(fill=alt.expr(contrast), fontSize=alt.expr("bandwidth('x') < 26 ? 8 : 11"))
     return (
         alt.layer(none, some, nothing.transform_filter("datum.shown === null"), seen, text.encode(text="label:N"))
@@ -59,8 +59,8 @@ def comparison(data: Any) -> alt.LayerChart:
     pooled = base.transform_filter("datum.seed === null")
     seeds = base.transform_filter("datum.seed !== null")
     band = pooled.mark_rule(strokeWidth=3, strokeCap="round", color=alt.expr("muted"), opacity=0.55)
-    scale = alt.Scale(type="symlog", constant=RATES[0], domain=[0, 1], nice=False)
-    axis = alt.Axis(values=[0, 0.001, 0.01, 0.1, 1], format="~%")
+    scale = alt.Scale(type="symlog", constant=RATES[0] / 4, domain=[0, 1], nice=False)
+    axis = alt.Axis(values=[0, 0.001, 0.01, 0.1, 1], labelExpr="100 * datum.value + ' %'")
     rate = alt.X("rate:Q", scale=scale, axis=axis, title="collisions of safe starts")
     dot = pooled.mark_circle(size=90, opacity=1, color=alt.expr("datum.rate > 0 ? danger : ink"))
     ring = seeds.mark_point(size=28, strokeWidth=1, opacity=0.8, color=alt.expr("muted"))
@@ -84,7 +84,7 @@ def learning_curves(data: Any, scale: str) -> alt.LayerChart:
     """
     base = alt.Chart(data).encode(
         x=alt.X("step:Q", title="step", axis=alt.Axis(grid=False, tickCount=5)),
-        y=alt.Y("value:Q", title=None, scale=alt.Scale(type=scale, zero=False), axis=alt.Axis(format="~g", tickCount=4)),
+        y=alt.Y("value:Q", title=None, scale=alt.Scale(type=scale, zero=False, nice=False), axis=alt.Axis(format="~g", tickCount=4, grid=False)),
         color=alt.Color("recipe:N", legend=alt.Legend(title=None, orient="bottom", columns=2, labelLimit=260)),
         detail="run:N",
     )
@@ -104,13 +104,10 @@ def encounter(path: Any, ghost: Any, across: str, frame: int = 0) -> alt.LayerCh
         across: name of the second axis, "y" or "z".
         frame: the one shown.
     """
-    view = {"frame": frame, "left": 0, "right": 10, "bottom": 0, "top": 10, "wide": 400, "high": 200}
-    along = alt.X("x:Q", title="x [m]", axis=alt.Axis(grid=False, tickCount=6)).scale(
-        domainMin=alt.expr("left"), domainMax=alt.expr("right"), nice=False, zero=False
-    )
-    up = alt.Y("y:Q", title=f"{across} [m]", axis=alt.Axis(grid=False, tickCount=4, titleAngle=0)).scale(
-        domainMin=alt.expr("bottom"), domainMax=alt.expr("top"), nice=False, zero=False
-    )
+    view = {"frame": frame, "left": 0, "right": 10, "bottom": 0, "top": 10}
+    sides = [alt.Scale(domain=[alt.expr(lo), alt.expr(hi)], nice=False, zero=False) for lo, hi in (("left", "right"), ("bottom", "top"))]
+    along = alt.X("x:Q", title="x [m]", scale=sides[0], axis=alt.Axis(grid=False, tickCount=6))
+    up = alt.Y("y:Q", title=f"{across} [m]", scale=sides[1], axis=alt.Axis(grid=False, tickCount=4))
     who = alt.Color("player:N", legend=None)
     order = alt.Order("frame:Q")
     gone = alt.Chart(path).encode(along, up, who)
@@ -141,19 +138,22 @@ def separation(data: Any, frame: int = 0) -> alt.LayerChart:
     Args:
         data: rows with frame, t (s), distance and radius (m).
         frame: the one marked.
+
+    Its signal "reach" is the largest distance shown, m.
     """
     base = alt.Chart(data).encode(x=alt.X("t:Q", title="t [s]", axis=alt.Axis(grid=False, tickCount=5)))
-    height = alt.Y("distance:Q", title="distance [m]", axis=alt.Axis(grid=False, tickCount=4))
+    scale = alt.Scale(domain=[0, alt.expr("reach")], nice=False)
+    height = alt.Y("distance:Q", title="distance [m]", scale=scale, axis=alt.Axis(grid=False, tickCount=4))
     forbidden = base.mark_area(color=alt.expr("danger"), opacity=0.12).encode(y="radius:Q")
     edge = base.mark_line(color=alt.expr("danger"), strokeWidth=1.2).encode(y="radius:Q")
-    line = base.mark_line(color=alt.expr("ink"), strokeWidth=1.8).encode(y=height)
+    line = base.mark_line(color=alt.expr("ink"), strokeWidth=1.8, clip=True).encode(y=height)
     now = base.transform_filter("datum.frame === frame")
     cursor = now.mark_rule(color=alt.expr("muted"), strokeDash=[3, 3])
-    dot = now.mark_circle(size=60, opacity=1, color=alt.expr("datum.distance < datum.radius ? danger : ink")).encode(y=height)
+    dot = now.mark_circle(size=60, opacity=1, clip=True, color=alt.expr("datum.distance < datum.radius ? danger : ink")).encode(y=height)
     return (
         alt.layer(forbidden, edge, line, cursor, dot)
         .properties(width="container", height=110)
-        .add_params(*_colors(), alt.param(name="frame", value=frame))
+        .add_params(*_colors(), alt.param(name="frame", value=frame), alt.param(name="reach", value=10))
     )
 
 

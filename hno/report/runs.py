@@ -36,8 +36,8 @@ SCHEMAS = (1, 2)
 ENDED = ("finished", "failed")
 """States of a job that has ended; any other is unfinished."""
 NOT_AVAILABLE = "n/a"
-CONDITIONS = ("clearance", "dt", "widen", "noise", "delay")
-"""Entries of results.json that say under which conditions episodes were played."""
+CONDITIONS = {"clearance": 0.02, "dt": 0.02, "widen": 1, "noise": 0, "delay": 0}
+"""Entries of results.json that say under which conditions episodes were played, and the usual ones, which go without saying."""
 
 
 class NoRunsError(ValueError):
@@ -75,8 +75,9 @@ class Run(NamedTuple):
 
     @property
     def conditions(self) -> str:
-        """How episodes were played, equal for runs that may be compared."""
-        return ", ".join(f"{name} {self.content[name]}" for name in CONDITIONS if name in self.content)
+        """How episodes were played, as far as that is special: equal for runs that may be compared."""
+        found = {name: self.content.get(name, usual) for name, usual in CONDITIONS.items()}
+        return ", ".join(f"{name} {value}" for name, value in found.items() if value != CONDITIONS[name])
 
 
 class Skipped(NamedTuple):

@@ -125,7 +125,8 @@ def _run(run: Run) -> list[Cell]:
 def generic(entries: Sequence[Mapping[str, Any]]) -> Table:
     """Any list of mappings; columns in the order in which they turn up."""
     columns = list(dict.fromkeys(str(key) for entry in entries[:ROWS] for key in entry))
-    return Table(columns, [Row([value_cell(entry.get(column)) for column in columns]) for entry in entries[:ROWS]])
+    heads = [column.replace("_", " ") for column in columns]
+    return Table(heads, [Row([value_cell(entry.get(column)) for column in columns]) for entry in entries[:ROWS]])
 
 
 def value_cell(value: Any) -> Cell:

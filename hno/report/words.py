@@ -96,19 +96,15 @@ def verdicts(recipes: Sequence[Recipe]) -> dict[str, list[str]]:
 
 
 def _verdict(recipe: Recipe, conditions: str, recipes: Sequence[Recipe]) -> str:
-    judged = {
-        "safe": "No start collided",
-        "rare": "Collisions are rare",
-        "unsafe": "Not safe",
-    }[quality(recipe.rate)]
+    judged = {"safe": "No start collides", "rare": "Collisions are rare", "unsafe": "Not safe"}[quality(recipe.rate)]
     most = worst(recipe.table)
     at = ""
     if recipe.rate.collisions and most is not None:
         at = f" Worst type {theta(most.theta)}: {most.collisions} of {most.starts:,}."
     others = [other.name for other in rivals(recipe, recipes)]
-    rest = f" Not told apart from {_list(others)}: intervals overlap." if others else ""
+    rest = f" Not told apart from {_list(others)}: the intervals overlap." if others else ""
     return (
-        f"{judged} with {recipe.name}: {rate(recipe.rate)}, {seeds(recipe)}, {conditions}.{at} "
+        f"{judged} ({seeds(recipe)}, {conditions}): 95 % interval {interval(recipe.rate.interval)}.{at} "
         f"Joint cost above the equilibrium's: {over_seeds(recipe.excess)}.{rest}"
     )
 

@@ -48,7 +48,7 @@ const axis = (cells, player) => [...new Set(cells.map(([theta]) => theta[player]
 function drawHeat(host) {
   const which = $("shown").value;
   const cells = DATA.maps[host.dataset.of];
-  const [first, second] = [axis(cells, 0), axis(cells, 1).reverse()];
+  const [first, second] = [axis(cells, 0), axis(cells, 1)];
   const known = new Map(cells.map((cell) => [cell[0].join(), cell]));
   const step = Math.max(13, Math.min(38, Math.floor((host.clientWidth - 44) / first.length)));
   const rows = second.flatMap((b) => first.map((a) => heatCell(known.get([a, b].join()), a, b, which, step)));
@@ -56,7 +56,7 @@ function drawHeat(host) {
 }
 
 function heatCell(cell, a, b, which, step) {
-  const names = { theta_1: String(a), theta_2: String(b) };
+  const names = { theta_1: a, theta_2: b };
   if (!cell) return { ...names, shown: undefined, label: "", seen: false, tip: `types ${types([a, b])}\nnot evaluated` };
   const [theta, hits, starts, seen, excess] = cell;
   const bounds = DATA.intervals[`${hits}/${starts}`];

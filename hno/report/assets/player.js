@@ -89,7 +89,8 @@ async function apart(episode) {
   const rows = episode.t.map((t, frame) => ({
     frame, t, radius: episode.radius[frame], distance: episode.radius[frame] + episode.gap[frame],
   }));
-  const view = await draw($("apart"), "separation", { distances: rows }, { frame: player.frame });
+  const reach = Math.min(Math.max(...rows.map((row) => row.distance)), 6 * Math.max(...episode.radius));
+  const view = await draw($("apart"), "separation", { distances: rows }, { frame: player.frame, reach });
   return (frame) => view?.signal("frame", frame).run();
 }
 
@@ -97,10 +98,11 @@ function describe(episode) {
   const between = episode.collided && Math.min(...episode.gap) >= 0 ? " (between the frames shown)" : "";
   const cost = episode.cost === null ? "n/a" : episode.cost.toFixed(1);
   const label = episode.label_cost === null ? "n/a" : episode.label_cost.toFixed(1);
-  const closest = episode.clearance === null ? "n/a" : `${episode.clearance.toFixed(2)} m`;
+  const closest = episode.clearance === null ? "clearance n/a"
+    : `comes ${Math.abs(episode.clearance).toFixed(2)} m ${episode.clearance > 0 ? "short of" : "inside"} the collision radius`;
   $("said").replaceChildren(
     element("span", { className: `tag ${episode.collided ? "bad" : "ok"}`, textContent: episode.collided ? "collision" : "safe" }),
-    ` ${episode.run}, types ${types(episode.theta)}, ${episode.kind}: closest approach ${closest} above the collision radius${between}, joint cost ${cost}, equilibrium ${label}.`,
+    ` ${episode.run}, types ${types(episode.theta)}, ${episode.kind}: ${closest}${between}. Joint cost ${cost}, the equilibrium's ${label}.`,
   );
 }
 
@@ -145,7 +147,7 @@ function list() {
       return element("option", { value: k, textContent: `${run} · ${types(theta)} · ${kind}${collided ? " · collision" : ""}` });
     }),
   );
-  if (left.includes(Number(before))) select.value = before;
+  if (before && left.includes(Number(before))) select.value = before;
   $("player").hidden = !left.length;
   if (left.length && select.value !== before) show();
 }
