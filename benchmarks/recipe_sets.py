@@ -61,8 +61,15 @@ RECIPES: dict[str, dict[str, str]] = {
         "hno, corners, 50": f"{STEPS} {CORNERS} operator=hno data.trajectories=50",
     },
     "activations": {
-        f"{name} {rate}": f"operator=sno activation={name} optimizer.lr={rate} trainer.max_steps=1000"
-        for name, rate in itertools.product(("tanh", "relu", "sin", "sin activation.frequency=10"), (1e-3, 3e-3, 1e-2))
+        f"{name} {rate:g}": f"{SHORT} activation={name} optimizer.lr={rate:g}"
+        for name, rates in {
+            "tanh": (1e-3, 3e-3, 1e-2, 3e-2),
+            "relu": (3e-3, 1e-2, 3e-2),
+            "sin": (3e-4, 1e-3, 3e-3),
+            "sin activation.frequency=10": (1e-3, 3e-3, 1e-2),
+            "sin activation.frequency=3": (3e-3, 1e-2, 3e-2),
+        }.items()
+        for rate in rates
     },
     "optimizers": {
         "soap 1e-2": SHORT,

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import lightning as L
 from omegaconf import DictConfig, OmegaConf
 
 from hno.cli.logs import StepLines, loggers, progress_bar
+from hno.cli.results import plain
 from hno.data import GameData
 from hno.data.curriculum import Curriculum
 from hno.data.labels import Report, default_cache
@@ -18,14 +18,6 @@ from hno.games import Game, make
 from hno.losses import losses
 from hno.operators import ValueOperator, operators
 from hno.operators.optimizers import make_optimizer
-
-
-def plain(config: DictConfig) -> dict[str, Any]:
-    """A configuration node as plain containers."""
-    content = OmegaConf.to_container(config, resolve=True)
-    assert isinstance(content, dict)
-    return {str(key): value for key, value in content.items()}
-
 
 SIZES = (
     "operator.width", "operator.depth", "data.trajectories", "data.validation", "data.workers", "trainer.max_steps",

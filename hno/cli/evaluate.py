@@ -16,10 +16,11 @@ from omegaconf import DictConfig, OmegaConf
 from hno.cli.build import cache_folder
 from hno.cli.config import run_command
 from hno.cli.logs import label_progress, send_lightning_to_hydra
-from hno.cli.results import Results, config_hash
+from hno.cli.results import Results, config_hash, plain, write_json
 from hno.cli.summary import report, show
 from hno.data.labels import Request, labels_for, safe_labels_for
-from hno.evaluation.closed_loop import TypeRow, collision_table
+from hno.evaluation.closed_loop import TypeRow, play, table_of
+from hno.evaluation.episodes import EPISODES, episodes
 from hno.evaluation.rollout import Disturbance, control_steps, rollout
 from hno.games import Game
 from hno.games.grid import parse_types
@@ -46,7 +47,10 @@ def evaluate(config: DictConfig) -> bool:
         log.error("Say which checkpoint to evaluate: python evaluate.py checkpoint=<path to best.ckpt>")
         return False
     folder = Path(HydraConfig.get().runtime.output_dir)
-    results = Results(folder / "results.json", {"checkpoint": config.checkpoint, "config_hash": config_hash(config)})
+    results = Results(
+        folder / "results.json",
+        {"checkpoint": config.checkpoint, "config_hash": config_hash(config), "config": plain(config)},
+    )
     try:
         _run(config, results)
     except Exception as error:
@@ -113,9 +117,11 @@ def evaluate_policy(
     """Roll out from the starts of the labels, put the table into the results and draw an episode."""
     began = time.perf_counter()
     disturbance = Disturbance(settings.noise, settings.delay, settings.seed)
-    arguments = settings.clearance, settings.dt, disturbance
-    table = collision_table(policy.game, policy, labels, policy.operator.seen_types, *arguments)
+    played = play(policy.game, policy, labels, settings.dt, disturbance)
+    table = table_of(played, labels, policy.operator.seen_types, settings.clearance)
     results.time("evaluation", time.perf_counter() - began)
+    write_json(results.path.parent / EPISODES, episodes(policy.game, played, labels, settings.clearance))
+    results.update(episodes=EPISODES)
     conditions = {name: settings[name] for name in ("clearance", "dt", "widen", "noise", "delay")}
     results.update(**conditions, table=[row._asdict() for row in table])
     draw(policy, labels[0], results.path.parent / "rollout.png", settings.dt)

@@ -16,15 +16,21 @@ from omegaconf import DictConfig, OmegaConf
 import hno
 from hno.data.store import replace_whole
 
-SCHEMA = 1
+SCHEMA = 2
 """Version of results.json."""
 PACKAGES = ("torch", "lightning", "torchmetrics", "hydra-core", "omegaconf", "wandb", "scipy", "safetensors")
 
 
-def config_hash(config: DictConfig) -> str:
-    """Hash of what determines a run's numbers; folders, logging and the number of workers do not."""
+def plain(config: DictConfig) -> dict[str, Any]:
+    """A configuration node as plain containers."""
     content = OmegaConf.to_container(config, resolve=True)
     assert isinstance(content, dict)
+    return {str(key): value for key, value in content.items()}
+
+
+def config_hash(config: DictConfig) -> str:
+    """Hash of what determines a run's numbers; folders, logging and the number of workers do not."""
+    content = plain(config)
     for key in ("logger", "resume", "checkpoint"):
         content.pop(key, None)
     for group, key in (("data", "cache"), ("data", "workers"), ("trainer", "print_every"), ("trainer", "threads")):
@@ -47,6 +53,12 @@ def finite(content: Any) -> Any:
     return None if isinstance(content, float) and not math.isfinite(content) else content
 
 
+def write_json(path: Path, content: Any, indent: int | None = None) -> None:
+    """Write a JSON file whole, with null for what JSON does not know."""
+    text = json.dumps(finite(content), indent=indent, allow_nan=False)
+    replace_whole(path, lambda draft: draft.write_text(text + "\n"))
+
+
 class Results:
     """The content of a results.json, written after every part of a run.
 
@@ -59,7 +71,7 @@ class Results:
         self.path = path
         self.content: dict[str, Any] = {
             "schema": SCHEMA, "status": "running", "reason": None, **head, "seconds": {}, "table": [],
-            "versions": versions(),
+            "episodes": None, "versions": versions(),
         }  # fmt: skip
         self.write()
 
@@ -75,5 +87,4 @@ class Results:
 
     def write(self) -> None:
         """Write the file whole."""
-        text = json.dumps(finite(self.content), indent=2, allow_nan=False)
-        replace_whole(self.path, lambda draft: draft.write_text(text + "\n"))
+        write_json(self.path, self.content, indent=2)

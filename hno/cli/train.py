@@ -7,6 +7,7 @@ import shutil
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import lightning as L
 import torch
@@ -18,11 +19,11 @@ from hno.cli.build import build_data, build_game, build_operator, build_trainer,
 from hno.cli.config import run_command
 from hno.cli.evaluate import check_evaluation, evaluate_policy, solve_tests
 from hno.cli.logs import label_progress, send_lightning_to_hydra
-from hno.cli.results import Results, config_hash
+from hno.cli.results import Results, config_hash, plain
 from hno.cli.summary import report, show
 from hno.data import GameData
 from hno.data.labels import Request, safe_labels_for
-from hno.data.trust import safe
+from hno.data.trust import safe, summary
 from hno.evaluation.callbacks import DivergedError
 from hno.evaluation.closed_loop import TypeRow
 from hno.evaluation.validation import BEST, ClosedLoopValidation
@@ -59,6 +60,7 @@ def train(config: DictConfig) -> bool:
         "seed": config.seed,
         "steps": config.trainer.max_steps,
         "config_hash": config_hash(config),
+        "config": plain(config),
     }
     results = Results(folder / "results.json", head)
     try:
@@ -117,6 +119,7 @@ def fit(config: DictConfig, folder: Path, results: Results) -> L.Trainer:
     data.prepare_data()
     data.setup("fit")
     results.time("labels", data.label_seconds)
+    results.update(label_statistics=label_statistics(data.extremals))
     if config.loss.scaled:
         operator.set_scales(Scales(*data.label_scales()))
     validation.begin(validation_labels(config, data, results))
@@ -137,6 +140,15 @@ def fit(config: DictConfig, folder: Path, results: Results) -> L.Trainer:
     best = None if validation.best is None else validation.best._asdict()
     results.update(steps=trainer.global_step, checkpoint=checkpoint, metrics=metrics, validation=best)
     return trainer
+
+
+def label_statistics(labels: Sequence[Extremal]) -> list[dict[str, Any]]:
+    """What the certificates of the training labels say, type by type."""
+    return [
+        {"theta": theta.tolist(), **summary(part(found, (found.theta == theta).all(-1)))}
+        for found in labels
+        for theta in found.theta.unique(dim=0)
+    ]
 
 
 def validation_labels(config: DictConfig, data: GameData, results: Results) -> list[Extremal]:

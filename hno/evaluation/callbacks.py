@@ -58,6 +58,13 @@ class StopOnDivergence(L.Callback):
         """Go on from it."""
         self.smallest = state_dict["smallest"]
 
+    def on_exception(self, trainer: L.Trainer, pl_module: L.LightningModule, exception: BaseException) -> None:
+        """Say what it means that an optimiser cannot factorise its statistics: a gradient was not finite."""
+        if isinstance(exception, torch.linalg.LinAlgError):  # type: ignore[attr-defined]  # public, not in __all__
+            raise DivergedError(
+                f"The optimiser failed at step {trainer.global_step}: the training diverged. {_ADVICE}"
+            ) from exception
+
     def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Test the weights, which the last step changed after its loss."""
         if not all(bool(weights.isfinite().all()) for weights in pl_module.parameters()):

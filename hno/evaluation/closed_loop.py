@@ -11,7 +11,7 @@ from torch import Tensor
 from hno.evaluation.metrics import CollisionRate, clopper_pearson
 from hno.evaluation.rollout import Disturbance, Policy, rollout
 from hno.games import Game
-from hno.types import Extremal, Status
+from hno.types import Extremal, Status, Trajectory
 
 
 class TypeRow(NamedTuple):
@@ -47,6 +47,27 @@ class TypeRow(NamedTuple):
     """Median over safe starts of the label's joint cost."""
 
 
+def play(
+    game: Game,
+    policy: Policy,
+    labels: Sequence[Extremal],
+    dt: float = 0.02,
+    disturbance: Disturbance = Disturbance(),
+) -> Trajectory:
+    """Roll out a policy from the start states of labels, one set after the other.
+
+    Args:
+        game: the game.
+        policy: feedback controls of all players.
+        labels: one set per type.
+        dt: time for which a control is held, s.
+        disturbance: of the controls.
+    """
+    starts = torch.cat([found.x[:, 0] for found in labels]).float()
+    types = torch.cat([found.theta for found in labels]).float()
+    return rollout(game, policy, starts, types, dt, disturbance=disturbance)
+
+
 def collision_table(
     game: Game,
     policy: Policy,
@@ -56,20 +77,24 @@ def collision_table(
     dt: float = 0.02,
     disturbance: Disturbance = Disturbance(),
 ) -> list[TypeRow]:
-    """Roll out a policy from the start states of labels and compare.
+    """`table_of` what the policy plays; arguments as there and in `play`."""
+    return table_of(play(game, policy, labels, dt, disturbance), labels, seen, clearance)
+
+
+def table_of(
+    played: Trajectory,
+    labels: Sequence[Extremal],
+    seen: Sequence[Sequence[float]],
+    clearance: float = 0.02,
+) -> list[TypeRow]:
+    """Compare episodes with the equilibria from the same starts, type by type.
 
     Args:
-        game: the game.
-        policy: feedback controls of all players.
+        played: what `play` returned for these labels.
         labels: one set per type.
         seen: types that the operator was trained with.
         clearance: what the label must keep for its start to count, m for distance constraints.
-        dt: time for which a control is held, s.
-        disturbance: of the controls.
     """
-    starts = torch.cat([found.x[:, 0] for found in labels]).float()
-    types = torch.cat([found.theta for found in labels]).float()
-    played = rollout(game, policy, starts, types, dt, disturbance=disturbance)
     sizes = [len(found.status) for found in labels]
     known = {tuple(float(t) for t in theta) for theta in seen}
     parts = (played.clearance.split(sizes), played.distance.split(sizes), played.value.split(sizes))

@@ -195,6 +195,12 @@ def test_a_run_that_diverged_at_once_names_no_checkpoint(command: Command, monke
     assert not list(run.folder.glob("*.ckpt"))
 
 
+def test_an_optimiser_that_cannot_go_on_is_divergence(command: Command) -> None:
+    """SOAP factorises products of gradients, which fails before the loss is tested."""
+    run = command("train", *EIGHT, "loss.weights.value=1e38", "loss.norm=l2", "loss.scaled=false")
+    diverged(run, "The optimiser failed at step 0")
+
+
 def test_another_failure_names_no_checkpoint(command: Command) -> None:
     with power_cut(RuntimeError("power cut")):
         run = command("train", *EIGHT)

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import csv
 import itertools
+import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,7 +23,7 @@ from tests.cli.conftest import SMOKE, Command, Outcome
 GAMES, OPERATORS, ACTIVATIONS = ("narrow_road", "lane_change", "drone"), ("hno", "sno"), ("tanh", "sin", "relu")
 KEYS = {
     "schema", "status", "reason", "game", "operator", "activation", "seed", "steps", "config_hash", "seconds", "table",
-    "versions",
+    "versions", "config", "episodes",
 }  # fmt: skip
 """Entries of results.json that are there however a run ends."""
 
@@ -71,13 +72,19 @@ def test_results_hold_every_part_of_the_run(command: Command) -> None:
     run = command("train", *SMOKE, "trainer.max_steps=4")
     results = run.results
     assert results.keys() >= KEYS | {"checkpoint", "metrics", "clearance", "dt", "test_seed"}
-    assert results["schema"] == 1
+    assert results["schema"] == 2
     assert results["seconds"].keys() == {"labels", "training", "validation", "test_labels", "evaluation"}
     assert all(seconds >= 0 for seconds in results["seconds"].values())
     assert results["versions"].keys() >= {"hno", "python", "torch", "lightning"}
     assert set(results["metrics"]) >= {"loss/total", "val/value_error", "val/costate_error"}
     (row,) = results["table"]
     assert tuple(row) == TypeRow._fields
+    (labels,) = results["label_statistics"]
+    assert (labels["theta"], labels["starts"]) == ([1, 1], 4)
+    assert sum(labels["status"].values()) == 4
+    assert results["config"]["trainer"]["max_steps"] == 4
+    kept = json.loads((run.folder / results["episodes"]).read_text())
+    assert {episode["kind"] for episode in kept["episodes"]} == {"worst", "typical"}
     assert row["theta"] == [1.0, 1.0]
     assert row["seen"]
     assert row["starts"] == 4

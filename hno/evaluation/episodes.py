@@ -1,0 +1,83 @@
+"""A few episodes of every type, small enough to be kept with the results and played back."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hno.evaluation.closed_loop import classify
+from hno.games import Game
+from hno.games.kinematics import separation
+from hno.types import Extremal, Trajectory
+
+EPISODES = "episodes.json"
+"""Name of their file inside a run's folder."""
+FRAMES = 50
+"""An episode is kept at about so many times."""
+
+
+def episodes(game: Game, played: Trajectory, labels: Sequence[Extremal], clearance: float) -> dict[str, Any]:
+    """The worst and the typical episode of every type, among the starts that count.
+
+    Args:
+        game: the game.
+        played: episodes from the start states of all labels, in their order.
+        labels: one set per type.
+        clearance: what the label must keep for its start to count, m for distance constraints.
+
+    Returns:
+        JSON content: positions of all players over time, the distance below which it is a collision, the path of the
+        equilibrium from the same start, costs. Types without a start that counts are left out.
+    """
+    first, kept = 0, []
+    for found in labels:
+        safe = classify(found, clearance)[0].nonzero().squeeze(-1)
+        for kind, row in _chosen(played.clearance[first + safe], played.distance[first + safe]).items():
+            start = int(safe[row])
+            kept.append({"kind": kind, **_episode(game, played, first + start, found, start)})
+        first += len(found.status)
+    dimensions = game.positions(played.x[:1, 0]).shape[-1]
+    return {"players": game.players, "dimensions": dimensions, "episodes": kept}
+
+
+def _chosen(clearance: Tensor, distance: Tensor) -> dict[str, int]:
+    """Rows by what they stand for: the smallest clearance (NaN first), and the median of the smallest distances."""
+    if len(clearance) == 0:
+        return {}
+    worst = clearance.nan_to_num(-math.inf).argmin()
+    return {"worst": int(worst), "typical": int(distance.argsort()[len(distance) // 2])}
+
+
+def _episode(game: Game, played: Trajectory, row: int, label: Extremal, start: int) -> dict[str, Any]:
+    stride = math.ceil(len(played.t) / FRAMES)
+    t, x, theta = played.t[::stride], played.x[row, ::stride], label.theta[start].to(played.x)
+    places = game.positions(x)
+    radius = game.constraint(x, theta.expand(len(t), -1)).amax(-1) + separation(places).amin(-1)
+    return {
+        "theta": [float(entry) for entry in theta],
+        "collided": not float(played.clearance[row]) > 0,
+        "clearance": _rounded(played.clearance[row]),
+        "distance": _rounded(played.distance[row]),
+        "cost": _rounded(-played.value[row].sum()),
+        "label_cost": _rounded(-label.value[start, 0].sum()),
+        "t": _rounded(t),
+        "positions": _rounded(places),
+        "radius": _rounded(radius),
+        "label_positions": _rounded(_at(t, label.t, game.positions(label.x[start].to(x)))),
+    }
+
+
+def _at(times: Tensor, t: Tensor, places: Tensor) -> Tensor:
+    """Positions (K, P, d) at nodes t, interpolated to other times."""
+    columns = [np.interp(times.cpu(), t.cpu(), column) for column in places.flatten(1).cpu().mT]
+    return torch.from_numpy(np.stack(columns, -1)).unflatten(-1, places.shape[1:])
+
+
+def _rounded(values: Tensor) -> Any:
+    """Numbers with three decimals, nested as the tensor is."""
+    return np.round(values.double().cpu().numpy(), 3).tolist()

@@ -1,0 +1,88 @@
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+from torch import Tensor
+
+from hno.evaluation.closed_loop import play
+from hno.evaluation.episodes import FRAMES, episodes
+from hno.games import make
+from hno.types import Extremal
+from tests.fakes import fake_labels
+from tests.walkers import Walkers
+
+
+def straight(tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
+    """Walk along x at 4 m/s: walkers who start at the same height miss each other by twice that."""
+    return torch.tensor([4.0, 0.0]).expand(len(x), 2, 2)
+
+
+def labelled(heights: list[float], clearance: list[float], theta: float) -> Extremal:
+    x0 = torch.tensor([[[0.0, y], [0.0, y]] for y in heights])
+    return fake_labels(Walkers(), (theta, theta), len(heights), 0, None, clearance, x0)
+
+
+@pytest.fixture
+def sets() -> list[Extremal]:
+    """Three types; of the first, the row with the smallest distance does not count; of the last, none does."""
+    return [
+        labelled([0.0, 0.9, 0.4, 0.05, 0.5], [0.0, 0.5, 0.5, 0.5, 0.5], 1.0),
+        labelled([0.8, 0.35, 0.7], [0.5, 0.5, 0.5], 2.0),
+        labelled([0.1], [-0.5], 3.0),
+    ]
+
+
+def test_the_worst_and_the_typical_start_that_count_are_kept(sets: list[Extremal]) -> None:
+    """Distances are 1.8, 0.8, 0.1, 1.0 and 1.6, 0.7, 1.4; the radius of a type is 0.2 + 0.2 theta."""
+    game = Walkers()
+    kept = episodes(game, play(game, straight, sets), sets, 0.02)
+    assert (kept["players"], kept["dimensions"]) == (2, 2)
+    found = [(e["theta"][0], e["kind"], e["distance"], e["collided"]) for e in kept["episodes"]]
+    assert found == [
+        (1.0, "worst", pytest.approx(0.1, abs=2e-3), True),
+        (1.0, "typical", pytest.approx(1.0, abs=2e-3), False),
+        (2.0, "worst", pytest.approx(0.7, abs=2e-3), False),
+        (2.0, "typical", pytest.approx(1.4, abs=2e-3), False),
+    ]
+    assert all(radius == pytest.approx(0.4, abs=1e-3) for radius in kept["episodes"][0]["radius"])
+
+
+def test_an_episode_shows_where_players_go_and_where_the_equilibrium_goes(sets: list[Extremal]) -> None:
+    game = Walkers()
+    played = play(game, straight, sets)
+    episode = episodes(game, played, sets, 0.02)["episodes"][0]
+    frames = len(episode["t"])
+    assert FRAMES / 2 < frames <= FRAMES + 1
+    assert (episode["t"][0], episode["t"][-1]) == (0.0, pytest.approx(game.horizon))
+    for name in ("positions", "label_positions"):
+        assert torch.tensor(episode[name]).shape == (frames, 2, 2)
+    torch.testing.assert_close(torch.tensor(episode["positions"][0]), game.positions(played.x[3, 0]), atol=1e-3, rtol=0)
+    assert episode["cost"] == pytest.approx(-float(played.value[3].sum()), abs=1e-3)
+    assert episode["label_cost"] == pytest.approx(-float(sets[0].value[3, 0].sum()), abs=1e-3)
+    middle = sets[0].x[3].float()
+    ends = game.positions(middle)[[0, -1]]
+    torch.testing.assert_close(torch.tensor(episode["label_positions"])[[0, -1]], ends, atol=1e-3, rtol=0)
+
+
+def test_a_broken_episode_is_the_worst(sets: list[Extremal]) -> None:
+    """What is not finite counts as a collision, and stays readable JSON once the writer has replaced it."""
+    played = play(Walkers(), straight, sets)
+    played.clearance[1] = torch.nan
+    worst = episodes(Walkers(), played, sets, 0.02)["episodes"][0]
+    assert (worst["kind"], worst["collided"]) == ("worst", True)
+    assert worst["distance"] == pytest.approx(1.8, abs=2e-3)
+
+
+def test_three_dimensions_and_the_size_of_the_file() -> None:
+    """Fifty episodes of a grid of types stay small enough to be embedded in a page."""
+    game = make("drone")
+    found = [fake_labels(game, (1.0, float(t)), 2, t, None, [0.5, 0.5]) for t in range(1, 4)]
+
+    def hover(tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
+        return torch.tensor([0.0, 0.0, 9.81]).expand(len(x), 2, 3)
+
+    kept = episodes(game, play(game, hover, found), found, 0.02)
+    assert kept["dimensions"] == 3
+    assert len(json.dumps(kept)) / len(kept["episodes"]) < 8000
