@@ -23,7 +23,7 @@ def percent(value: float | None, digits: int = 2) -> str:
 
 def signed(value: float | None) -> str:
     """A relative difference."""
-    return NOT_AVAILABLE if value is None else f"{100 * value:+.1f} %"
+    return NOT_AVAILABLE if value is None else f"{100 * value:+,.1f} %"
 
 
 def interval(bounds: tuple[float, float] | None) -> str:

@@ -1,5 +1,5 @@
 /** Plays one episode: views from above and, in space, from the side, and the distance over time. */
-const player = { frame: 0, clock: 0, playing: false, episode: null, views: [] };
+const player = { frame: 0, fresh: true, clock: 0, playing: false, episode: null, views: [] };
 
 /** Undoes the differences in which a series is written. */
 function series(differences, scale) {
@@ -57,7 +57,7 @@ async function show() {
   $("top").parentElement.classList.toggle("two", solid);
   $("scrub").max = episode.t.length - 1;
   describe(episode);
-  player.frame = Math.min(player.frame, episode.t.length - 1);
+  player.frame = player.fresh ? episode.gap.indexOf(Math.min(...episode.gap)) : Math.min(player.frame, episode.t.length - 1);
   player.views = [];
   const scenes = [["top", 1], ...(solid ? [["side", 2]] : [])].map(([name, up]) => scene(episode, name, up));
   const made = await Promise.all([...scenes, apart(episode)]);
@@ -121,7 +121,8 @@ function play(on) {
   $("play").setAttribute("aria-label", on ? "Pause" : "Play");
   if (!on) return;
   const { t } = player.episode;
-  if (player.frame >= t.length - 1) seek(0);
+  if (player.fresh || player.frame >= t.length - 1) seek(0);
+  player.fresh = false;
   player.clock = t[player.frame];
   let last = performance.now();
   requestAnimationFrame(function tick(now) {
@@ -149,25 +150,32 @@ function list() {
   );
   if (before && left.includes(Number(before))) select.value = before;
   $("player").hidden = !left.length;
-  if (left.length && select.value !== before) show();
+  if (left.length && select.value !== before) pick();
+}
+
+/** A newly chosen episode stands at its closest approach; playing begins at its start. */
+function pick() {
+  player.fresh = true;
+  show();
 }
 
 function turn(by) {
   const select = $("episode");
   select.selectedIndex = (select.selectedIndex + by + select.length) % select.length;
-  show();
+  play(false);
+  pick();
 }
 
 if ($("player")) {
   $("play").addEventListener("click", () => play(!player.playing));
   $("scrub").addEventListener("input", () => {
     play(false);
+    player.fresh = false;
     seek(Number($("scrub").value));
   });
   $("episode").addEventListener("change", () => {
     play(false);
-    player.frame = 0;
-    show();
+    pick();
   });
   $("previous").addEventListener("click", () => turn(-1));
   $("next").addEventListener("click", () => turn(1));
