@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import statistics
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
@@ -46,7 +47,7 @@ class Spread(NamedTuple):
     """Student's t interval of the mean; None for one seed."""
     low: float
     high: float
-    count: int
+    seeds: int
 
 
 class Recipe(NamedTuple):
@@ -120,10 +121,10 @@ def mean(values: Iterable[float | None]) -> float | None:
 
 
 def excess(rows: Iterable[TypeResult]) -> float | None:
-    """Sum over types of the median excess cost, relative to that of the equilibria's median costs."""
-    known = [(row.excess, row.label_cost) for row in rows if row.excess is not None and row.label_cost is not None]
-    cost = math.fsum(abs(label) for _, label in known)
-    return math.fsum(above for above, _ in known) / cost if cost else None
+    """Median over types of the median excess cost, relative to the median of the equilibria's costs."""
+    known = [(row.excess, row.label_cost) for row in rows if row.excess is not None]
+    ratios = [above / abs(cost) for above, cost in known if cost]
+    return statistics.median(ratios) if ratios else None
 
 
 def worst(rows: Iterable[TypeResult]) -> TypeResult | None:
@@ -178,7 +179,14 @@ def _variants(settings: Sequence[Mapping[str, str]]) -> list[str]:
     keys = sorted({key for one in settings for key in one})
     differing = [key for key in keys if len({one.get(key) for one in settings}) > 1]
     more = [f"{len(differing) - SHOWN} more"] if len(differing) > SHOWN else []
-    return [", ".join([f"{key}={one.get(key, NOT_AVAILABLE)}" for key in differing[:SHOWN]] + more) for one in settings]
+    return [", ".join([f"{key}={_short(one.get(key))}" for key in differing[:SHOWN]] + more) for one in settings]
+
+
+def _short(text: str | None) -> str:
+    """A setting for a label: of a path its last three parts, of anything else the beginning."""
+    if text is None:
+        return NOT_AVAILABLE
+    return "/".join(text.split("/")[-3:]) if "/" in text else text[:40]
 
 
 def _recipe(names: tuple[str, ...], variant: str, runs: Sequence[Run]) -> Recipe:

@@ -1,17 +1,19 @@
-"""Charts, declared with Altair: the page fills them with data and moves them by their signals, figures are drawn of them."""
+"""Charts, declared with Altair: the page fills in data and moves signals, figures are drawn of them."""
 
 from __future__ import annotations
 
 import functools
 import json
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, Literal
 
 import altair as alt
 import vl_convert
 
 from hno.report.palette import LIGHT, signals
 
-
+Layers = alt.LayerChart | alt.FacetChart
+"""What Altair makes of charts on top of each other."""
 RATES = (0.001, 1.0)
 """Ends of the logarithmic colour scale of collision rates, the same everywhere; rates below have the first colour."""
 CELL = 34
@@ -22,7 +24,7 @@ def _colors() -> list[alt.Parameter]:
     return [alt.param(name=name, value=color) for name, color in signals(LIGHT).items()]
 
 
-def heat_map(data: Any, legend: alt.Legend | None = None) -> alt.LayerChart:
+def heat_map(data: Any, legend: alt.Legend | None = None) -> Layers:
     """Collision rates over the types of two players.
 
     Args:
@@ -39,7 +41,9 @@ def heat_map(data: Any, legend: alt.Legend | None = None) -> alt.LayerChart:
     some = cells.transform_filter("datum.shown > 0").encode(color=alt.Color("shown:Q", scale=scale, legend=legend))
     none = cells.mark_rect(cornerRadius=3, fill=alt.expr("zero")).transform_filter("datum.shown === 0")
     nothing = base.mark_rect(cornerRadius=3, fill="transparent", stroke=alt.expr("muted"), strokeDash=[2, 3])
-    seen = base.mark_rect(cornerRadius=3, fill=None, stroke=alt.expr("ink"), strokeWidth=2).transform_filter("datum.seen")
+    seen = base.mark_rect(cornerRadius=3, fill=None, stroke=alt.expr("ink"), strokeWidth=2).transform_filter(
+        "datum.seen"
+    )
     contrast = "datum.shown > 0 ? (luminance(scale('color', datum.shown)) < 0.2 ? '#fff' : '#111') : muted"
     text = base.mark_text(fill=alt.expr(contrast), fontSize=alt.expr("bandwidth('x') < 26 ? 8 : 11"))
     return (
@@ -49,13 +53,15 @@ def heat_map(data: Any, legend: alt.Legend | None = None) -> alt.LayerChart:
     )
 
 
-def comparison(data: Any) -> alt.LayerChart:
+def comparison(data: Any) -> Layers:
     """Collision rates of recipes with their intervals, and of their seeds.
 
     Args:
         data: rows with recipe, rate, low, high, seed (null for the pooled rate), tip; in the order to be shown.
     """
-    base = alt.Chart(data).encode(y=alt.Y("recipe:N", sort=None, title=None, axis=alt.Axis(labelLimit=260, ticks=False, domain=False)))
+    base = alt.Chart(data).encode(
+        y=alt.Y("recipe:N", sort=None, title=None, axis=alt.Axis(labelLimit=260, ticks=False, domain=False))
+    )
     pooled = base.transform_filter("datum.seed === null")
     seeds = base.transform_filter("datum.seed !== null")
     band = pooled.mark_rule(strokeWidth=3, strokeCap="round", color=alt.expr("muted"), opacity=0.55)
@@ -75,7 +81,7 @@ def comparison(data: Any) -> alt.LayerChart:
     )
 
 
-def learning_curves(data: Any, scale: str) -> alt.LayerChart:
+def learning_curves(data: Any, scale: Literal["log", "linear"]) -> Layers:
     """A metric over training steps, one line for every run.
 
     Args:
@@ -84,7 +90,12 @@ def learning_curves(data: Any, scale: str) -> alt.LayerChart:
     """
     base = alt.Chart(data).encode(
         x=alt.X("step:Q", title="step", axis=alt.Axis(grid=False, tickCount=5)),
-        y=alt.Y("value:Q", title=None, scale=alt.Scale(type=scale, zero=False, nice=False), axis=alt.Axis(format="~g", tickCount=4, grid=False)),
+        y=alt.Y(
+            "value:Q",
+            title=None,
+            scale=alt.Scale(type=scale, zero=False, nice=False),
+            axis=alt.Axis(format="~g", tickCount=4, grid=False),
+        ),
         color=alt.Color("recipe:N", legend=alt.Legend(title=None, orient="bottom", columns=2, labelLimit=260)),
         detail="run:N",
     )
@@ -93,7 +104,7 @@ def learning_curves(data: Any, scale: str) -> alt.LayerChart:
     return alt.layer(lines, points).properties(width="container", height=200)
 
 
-def encounter(path: Any, ghost: Any, across: str, frame: int = 0) -> alt.LayerChart:
+def encounter(path: Any, ghost: Any, across: str, frame: int = 0, window: Mapping[str, float] | None = None) -> Layers:
     """Two players on their way, seen from above or from the side, in true proportion.
 
     The disc around a player has half the collision radius: discs that overlap are a collision.
@@ -103,9 +114,13 @@ def encounter(path: Any, ghost: Any, across: str, frame: int = 0) -> alt.LayerCh
         ghost: rows with frame, player, x, y along the equilibrium.
         across: name of the second axis, "y" or "z".
         frame: the one shown.
+        window: "left", "right", "bottom" and "top" of the part of space that is shown, m; signals of the page.
     """
-    view = {"frame": frame, "left": 0, "right": 10, "bottom": 0, "top": 10}
-    sides = [alt.Scale(domain=[alt.expr(lo), alt.expr(hi)], nice=False, zero=False) for lo, hi in (("left", "right"), ("bottom", "top"))]
+    view = {"frame": frame, "left": 0.0, "right": 10.0, "bottom": 0.0, "top": 10.0, **(window or {})}
+    sides = [
+        alt.Scale(domain=[alt.expr(lo), alt.expr(hi)], nice=False, zero=False)
+        for lo, hi in (("left", "right"), ("bottom", "top"))
+    ]
     along = alt.X("x:Q", title="x [m]", scale=sides[0], axis=alt.Axis(grid=False, tickCount=6))
     up = alt.Y("y:Q", title=f"{across} [m]", scale=sides[1], axis=alt.Axis(grid=False, tickCount=4))
     who = alt.Color("player:N", legend=None)
@@ -115,24 +130,24 @@ def encounter(path: Any, ghost: Any, across: str, frame: int = 0) -> alt.LayerCh
     size = "PI * pow(scale('x', datum.x + datum.radius / 2) - scale('x', datum.x), 2)"
     expected = alt.Chart(ghost).mark_line(strokeDash=[5, 4], strokeWidth=1.5, opacity=0.55, clip=True)
     trail = gone.mark_line(strokeWidth=2.5, clip=True, strokeCap="round").transform_filter("datum.frame <= frame")
-    discs = {"size": alt.expr(size), "strokeWidth": 1.5, "clip": True, "fillOpacity": 0.22, "opacity": 1}
-    own = alt.expr("scale('color', datum.player)")
-    safe = now.transform_filter("datum.gap >= 0").mark_point(filled=True, stroke=own, **discs)
-    struck = now.transform_filter("datum.gap < 0").mark_point(
-        fill=alt.expr("danger"), stroke=alt.expr("danger"), **{**discs, "fillOpacity": 0.5}
-    )
+    own, danger = alt.expr("scale('color', datum.player)"), alt.expr("danger")
+    safe, struck = now.transform_filter("datum.gap >= 0"), now.transform_filter("datum.gap < 0")
     at = now.mark_point(filled=True, size=30, opacity=1, clip=True)
     return (
         alt.layer(
-            expected.encode(along, up, who, order), trail.encode(order), safe,
-            struck.encode(color=alt.Undefined), at,
+            expected.encode(along, up, who, order),
+            trail.encode(order),
+            safe.mark_point(filled=True, stroke=own, size=alt.expr(size), fillOpacity=0.22, opacity=1, clip=True),
+            struck.mark_point(fill=danger, stroke=danger, size=alt.expr(size), fillOpacity=0.5, opacity=1, clip=True)
+            .encode(color=alt.Undefined),
+            at,
         )
         .properties(width=400, height=200)
         .add_params(*_colors(), *(alt.param(name=name, value=value) for name, value in view.items()))
     )  # fmt: skip
 
 
-def separation(data: Any, frame: int = 0) -> alt.LayerChart:
+def separation(data: Any, frame: int = 0) -> Layers:
     """Distance between players over time, with the distance below which it is a collision.
 
     Args:
@@ -149,7 +164,9 @@ def separation(data: Any, frame: int = 0) -> alt.LayerChart:
     line = base.mark_line(color=alt.expr("ink"), strokeWidth=1.8, clip=True).encode(y=height)
     now = base.transform_filter("datum.frame === frame")
     cursor = now.mark_rule(color=alt.expr("muted"), strokeDash=[3, 3])
-    dot = now.mark_circle(size=60, opacity=1, clip=True, color=alt.expr("datum.distance < datum.radius ? danger : ink")).encode(y=height)
+    dot = now.mark_circle(
+        size=60, opacity=1, clip=True, color=alt.expr("datum.distance < datum.radius ? danger : ink")
+    ).encode(y=height)
     return (
         alt.layer(forbidden, edge, line, cursor, dot)
         .properties(width="container", height=110)
@@ -176,16 +193,17 @@ def compiled(chart: alt.TopLevelMixin) -> dict[str, Any]:
     """A chart as Vega, without a configuration of its own."""
     specification = chart.to_dict()
     specification.pop("config", None)
-    vega = vl_convert.vegalite_to_vega(specification, vl_version=_version())
+    vega = vl_convert.vegalite_to_vega(specification, vl_version=version())
     for name in ("config", "background", "$schema"):
         vega.pop(name, None)
     return json.loads(json.dumps(vega))
 
 
-def _version() -> str:
+def version() -> str:
+    """The version of Vega-Lite that Altair writes."""
     return ".".join(alt.SCHEMA_VERSION.removeprefix("v").split(".")[:2])
 
 
 def library() -> str:
     """Vega-Embed, with Vega inside, as one script that defines `window.vegaEmbed`."""
-    return vl_convert.javascript_bundle("window.vegaEmbed = vegaEmbed;", vl_version=_version())
+    return vl_convert.javascript_bundle("window.vegaEmbed = vegaEmbed;", vl_version=version())

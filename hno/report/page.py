@@ -48,7 +48,9 @@ def render(sweep: Sweep, refresh: float | None = None) -> str:
 
 
 def _fill(content: Mapping[str, Any], data: Mapping[str, Any], played: payload.Budgeted) -> str:
-    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment = jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
     template = environment.from_string((ASSETS / "page.html.j2").read_text(encoding="utf-8"))
     return template.render(**content, played=played, data=embedded({**data, "episodes": played.content}))
 
@@ -58,7 +60,7 @@ def embedded(content: Any) -> Markup:
     text = json.dumps(content, separators=(",", ":"), sort_keys=True, allow_nan=False)
     for character in "<>&\u2028\u2029":
         text = text.replace(character, f"\\u{ord(character):04x}")
-    return Markup(text)  # noqa: S704 - escaped above
+    return Markup(text)
 
 
 def _content(sweep: Sweep, refresh: float | None) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -75,7 +77,9 @@ def _content(sweep: Sweep, refresh: float | None) -> tuple[dict[str, Any], dict[
         "comparison": payload.comparison(found),
         "curves": curves.content,
         "charts": specifications(),
-        "themes": {name: {"config": chart_config(p), "signals": signals(p)} for name, p in (("light", LIGHT), ("dark", DARK))},
+        "themes": {
+            name: {"config": chart_config(p), "signals": signals(p)} for name, p in (("light", LIGHT), ("dark", DARK))
+        },
         "refresh": refresh,
     }
     content = {
@@ -95,7 +99,9 @@ def _content(sweep: Sweep, refresh: float | None) -> tuple[dict[str, Any], dict[
         "curve_games": sorted({entry["game"] for entry in curves.content}),
         "compared_games": sorted({recipe.game for recipe in found if recipe.rate.starts}),
         "labels": label_tables(sweep.runs),
-        "sections": [(run.name, names_of(run, "any"), sections(run)) for run in sweep.runs if sections(run)][:SECTION_RUNS],
+        "sections": [(run.name, names_of(run, "any"), sections(run)) for run in sweep.runs if sections(run)][
+            :SECTION_RUNS
+        ],
         "common": common,
         "differing": differing,
         "versions": _versions(sweep.runs),
@@ -103,9 +109,9 @@ def _content(sweep: Sweep, refresh: float | None) -> tuple[dict[str, Any], dict[
         "commands": [(run.name, run.command or f"{NOT_AVAILABLE}: no .hydra/overrides.yaml") for run in sweep.runs],
         "refresh": refresh,
         "variables": {"light": _variables(LIGHT), "dark": _variables(DARK)},
-        "style": Markup(_asset("page.css")),  # noqa: S704 - ours
-        "vega": Markup(_script(library())),  # noqa: S704 - Vega's
-        "script": Markup(_script("\n".join(_asset(name) for name in SCRIPTS))),  # noqa: S704 - ours
+        "style": Markup(_asset("page.css")),
+        "vega": Markup(_script(library())),
+        "script": Markup(_script("\n".join(_asset(name) for name in SCRIPTS))),
     }
     return content, data
 
@@ -125,11 +131,12 @@ def _variables(palette: Palette) -> Markup:
     players = {f"player-{k + 1}": color for k, color in enumerate(palette.category[:4])}
     scale = _gradient(palette)
     pairs = {**names, **players, "rates": scale, "font": FONT}
-    return Markup("".join(f"--{name}:{value};" for name, value in pairs.items()))  # noqa: S704 - ours
+    return Markup("".join(f"--{name}:{value};" for name, value in pairs.items()))
 
 
 INFERNO = (
-    "#000004", "#160b39", "#420a68", "#6a176e", "#932667", "#bc3754", "#dd513a", "#f37819", "#fca50a", "#f6d746", "#fcffa4",
+    "#000004", "#160b39", "#420a68", "#6a176e", "#932667", "#bc3754", "#dd513a", "#f37819", "#fca50a", "#f6d746",
+    "#fcffa4",
 )  # fmt: skip
 """The scale of heat maps in steps of a tenth, for the legend."""
 
@@ -145,7 +152,9 @@ def _games(found: Sequence[Recipe]) -> list[dict[str, Any]]:
     chosen: dict[str, list[Recipe]] = {}
     for (game, _), recipe in best(found).items():
         chosen.setdefault(game, []).append(recipe)
-    sentences = words.verdicts(found)
+    sentences: dict[str, list[str]] = {}
+    for game, _, text in words.verdicts(found):
+        sentences.setdefault(game, []).append(text)
     games = sorted({recipe.game for recipe in found})
     return [_game(game, chosen.get(game, []), sentences.get(game, [])) for game in games]
 
@@ -166,7 +175,9 @@ def _cards(runs: Sequence[Run], found: Sequence[Recipe]) -> list[dict[str, Any]]
     """Heat maps of recipes over their seeds, safest first, then those of single runs."""
     ordered = sorted(found, key=lambda recipe: (recipe.game, recipe.rate.value or 0.0))
     pooled = [
-        _card(f"r{k}", names_of(one, "recipe"), one.name, words.seeds(one), one.table) for k, one in enumerate(ordered) if one.runs
+        _card(f"r{k}", names_of(one, "recipe"), one.name, words.seeds(one), one.table)
+        for k, one in enumerate(ordered)
+        if one.runs
     ]
     names = {run.name: recipe.name for recipe in found for run in recipe.runs}
     single = [
@@ -181,8 +192,9 @@ def _card(identifier: str, names: Mapping[str, str], title: str, counted: str, r
     at = f", worst {words.theta(most.theta)}" if most is not None and most.collisions else ""
     return {
         "id": identifier, "names": names, "title": title, "quality": words.quality(counts), "counted": counted,
-        "text": f"{counts.collisions:,} of {counts.starts:,}: {words.percent(counts.value)}",
-        "interval": words.interval(counts.interval), "worst": at, "table": rows, "map": len(rows[0].theta) == 2 if rows else False,
+        "text": words.share(counts),
+        "interval": words.interval(counts.interval), "worst": at, "table": rows,
+        "map": bool(rows) and len(rows[0].theta) == 2,
     }  # fmt: skip
 
 
@@ -199,7 +211,9 @@ def _settings(runs: Sequence[Run], found: Sequence[Recipe]) -> tuple[dict[str, s
     common = {key: str(next(iter(values[key])))[:300] for key in keys if len(values[key]) == 1}
     rest = [key for key in keys if len(values[key]) > 1 and key != "seed"]
     rows = [
-        {"game": one.game, "recipe": one.name, **{key: one.runs[0].settings.get(key) for key in rest}} for one in found if one.runs
+        {"game": one.game, "recipe": one.name, **{key: one.runs[0].settings.get(key) for key in rest}}
+        for one in found
+        if one.runs
     ]
     return common, generic(rows) if rest and rows else None
 
@@ -213,6 +227,9 @@ def _versions(runs: Sequence[Run]) -> list[tuple[str, str]]:
             counts = found.setdefault(str(package), {})
             counts[str(version)] = counts.get(str(version), 0) + 1
     return [
-        (package, next(iter(counts)) if len(counts) == 1 else ", ".join(f"{v} ({n} runs)" for v, n in sorted(counts.items())))
+        (
+            package,
+            next(iter(counts)) if len(counts) == 1 else ", ".join(f"{v} ({n} runs)" for v, n in sorted(counts.items())),
+        )
         for package, counts in found.items()
     ]

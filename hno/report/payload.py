@@ -1,4 +1,4 @@
-"""What the page's script works with: heat maps, learning curves and episodes as compact JSON, within a budget of bytes."""
+"""What the page's script works with: heat maps, learning curves and episodes as compact JSON, within budgets."""
 
 from __future__ import annotations
 
@@ -105,14 +105,15 @@ def episodes(runs: Sequence[Run], budget: int) -> Budgeted:
     """Episodes that fit into a budget: the worst and a typical one of every run first, then by clearance."""
     ranked: list[tuple[int, float, Run, Episode]] = []
     for run in runs:
-        ordered = sorted(run.episodes, key=_clearance)
+        ordered = sorted(run.episodes, key=clearance)
         first = {id(next((e for e in ordered if e.kind == kind), None)) for kind in ("worst", "typical")}
-        ranked += [(2 * (id(e) not in first) + (e.kind != "worst"), _clearance(e), run, e) for e in ordered]
+        ranked += [(2 * (id(e) not in first) + (e.kind != "worst"), clearance(e), run, e) for e in ordered]
     ranked.sort(key=lambda entry: entry[:2])
     return _within((_episode(run, found) for _, _, run, found in ranked), budget, len(ranked))
 
 
-def _clearance(found: Episode) -> float:
+def clearance(found: Episode) -> float:
+    """What episodes are ranked by; without a clearance they come last."""
     return np.inf if found.clearance is None else found.clearance
 
 

@@ -3,17 +3,11 @@
 from __future__ import annotations
 
 import math
-import shlex
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-import yaml
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.errors import HydraException
-from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
-
+from hno.report.hydra_files import command_of, read_yaml, sweep_of
 from hno.report.parsing import (
     Curves,
     Episode,
@@ -37,7 +31,7 @@ ENDED = ("finished", "failed")
 """States of a job that has ended; any other is unfinished."""
 NOT_AVAILABLE = "n/a"
 CONDITIONS = {"clearance": 0.02, "dt": 0.02, "widen": 1, "noise": 0, "delay": 0}
-"""Entries of results.json that say under which conditions episodes were played, and the usual ones, which go without saying."""
+"""Entries of results.json that say how episodes were played, with the usual values, which go without saying."""
 
 
 class NoRunsError(ValueError):
@@ -106,18 +100,20 @@ def load(root: Path) -> Sweep:
         NoRunsError: there is none.
     """
     if not root.is_dir():
-        raise NoRunsError(f"{root} is not a folder. Give the folder of a run or of a sweep, such as multirun/<date>/<time>.")
+        raise NoRunsError(
+            f"{root} is not a folder. Give the folder of a run or of a sweep, such as multirun/<date>/<time>."
+        )
     runs, skipped = [], []
     for folder in _candidates(root):
         name = root.resolve().name if folder == root else folder.relative_to(root).as_posix()
         try:
-            runs.append(read_run(folder, name))
+            runs += read_runs(folder, name)
         except UnreadableError as error:
             skipped.append(Skipped(name, str(error)))
     if not runs:
         found = "; ".join(f"{entry.name}: {entry.reason}" for entry in skipped[:3]) or f"no {RESULTS} in it or below"
         raise NoRunsError(f"{root} holds no run ({found}). Runs are written by train.py and evaluate.py.")
-    command, planned = _sweep(root / "multirun.yaml")
+    command, planned = sweep_of(root / "multirun.yaml")
     return Sweep(root.resolve().name, tuple(runs), tuple(skipped), command, planned)
 
 
@@ -133,17 +129,32 @@ def _natural(path: Path) -> list[tuple[float, str]]:
     return [(float(head) if head.isdecimal() else math.inf, part) for head, part in heads]
 
 
-def read_run(folder: Path, name: str) -> Run:
-    """One run; parts that cannot be read are left out and noted.
+def read_runs(folder: Path, name: str) -> list[Run]:
+    """The run of a folder, or one for each model of an evaluation; parts that cannot be read are left out and noted.
 
     Raises:
         UnreadableError: it has no results, or foreign ones.
     """
+    content = _results(folder)
+    models = records(content.get("models"))
+    if len(models) < 2:
+        return [_run(folder, name, content)]
+    rest = {key: value for key, value in content.items() if key not in ("models", "episodes", "comparison")}
+    first = {**content, **models[0]}
+    contents = [first, *({**rest, **model} for model in models[1:])]
+    return [_run(folder, f"{name} [{k}]", one) for k, one in enumerate(contents)]
+
+
+def _results(folder: Path) -> dict[str, Any]:
     if not (folder / RESULTS).exists():
         raise UnreadableError(f"no {RESULTS}: the job has only begun, or ended before it could write any")
     content = read_json(folder / RESULTS)
     if not (isinstance(content, dict) and isinstance(content.get("status"), str) and "table" in content):
         raise UnreadableError(f"{RESULTS} is not hno's: it has no status and table")
+    return content
+
+
+def _run(folder: Path, name: str, content: Mapping[str, Any]) -> Run:
     notes: list[str] = []
     if content.get("schema") not in SCHEMAS:
         notes.append(f"{RESULTS} has schema {content.get('schema')!r}; known are {SCHEMAS}")
@@ -151,11 +162,11 @@ def read_run(folder: Path, name: str) -> Run:
     return Run(
         name, content["status"], _text(content.get("reason")), game, operator, activation, whole(content.get("seed")),
         content,
-        tuple(_each(content["table"], type_result, "row of the table", notes)),
+        tuple(_each(content.get("table"), type_result, "row of the table", notes)),
         _settings(folder, content, notes),
         _curves(folder / "csv" / "metrics.csv", notes),
         tuple(_episodes(folder, content, notes)),
-        _command(folder),
+        command_of(folder),
         tuple(notes),
     )  # fmt: skip
 
@@ -205,65 +216,14 @@ def _episodes(folder: Path, content: Mapping[str, Any], notes: list[str]) -> lis
 
 
 def _settings(folder: Path, content: Mapping[str, Any], notes: list[str]) -> dict[str, str]:
-    if isinstance(content.get("config"), dict):
-        return flatten(content["config"])
-    try:
-        return flatten(_yaml(folder / ".hydra" / "config.yaml") or {})
-    except UnreadableError as error:
-        notes.append(f"no settings: {error}")
-        return {}
-
-
-def _yaml(path: Path) -> Any:
-    """Content of a YAML file as it is written, interpolations too; None where there is none."""
-    if not path.exists():
-        return None
-    try:
-        return OmegaConf.to_container(OmegaConf.load(path))
-    except (OSError, ValueError, yaml.YAMLError, OmegaConfBaseException) as error:
-        raise UnreadableError(f"{path.name} is not YAML ({str(error).splitlines()[0]:.80})") from error
-
-
-def _command(folder: Path) -> str | None:
-    try:
-        overrides, hydra = (_yaml(folder / ".hydra" / name) for name in ("overrides.yaml", "hydra.yaml"))
-    except UnreadableError:
-        return None
-    return None if not isinstance(overrides, list) else _command_line(hydra, overrides)
-
-
-def _command_line(hydra: Any, arguments: list[Any]) -> str:
-    """What to type; the script is named after Hydra's job."""
-    job = _dig(hydra, "hydra", "job", "name") or "train"
-    return shlex.join(["python", f"{job}.py", *(str(argument) for argument in arguments)])
-
-
-def _dig(content: Any, *keys: str) -> Any:
-    for key in keys:
-        content = content.get(key) if isinstance(content, dict) else None
-    return content
-
-
-def _sweep(path: Path) -> tuple[str | None, int | None]:
-    """The command line of a sweep and how many jobs it has."""
-    try:
-        content = _yaml(path)
-    except UnreadableError:
-        return None, None
-    overrides = _dig(content, "hydra", "overrides", "task")
-    if not isinstance(overrides, list):
-        return None, None
-    return _command_line(content, ["-m", *overrides]), _jobs([str(entry) for entry in overrides])
-
-
-def _jobs(overrides: list[str]) -> int | None:
-    try:
-        parsed = OverridesParser.create().parse_overrides(overrides)
-        return math.prod(
-            len(list(entry.sweep_string_iterator())) if entry.is_sweep_override() else 1 for entry in parsed
-        )
-    except HydraException:
-        return None
+    config = content.get("config")
+    if not isinstance(config, dict):
+        try:
+            config = read_yaml(folder / ".hydra" / "config.yaml")
+        except UnreadableError as error:
+            notes.append(f"no settings: {error}")
+    found = flatten(config) if isinstance(config, dict) else {}
+    return {**found, "checkpoint": str(content.get("checkpoint"))} if "checkpoint" in found else found
 
 
 def label_statistics(run: Run) -> list[Mapping[str, Any]]:

@@ -14,6 +14,8 @@ from hno.report.words import interval, number, over_seeds, percent, signed, thet
 
 LONGEST = 400
 """Characters of a cell that are kept."""
+LISTED = 6
+"""Numbers of a list that are shown."""
 ROWS = 200
 """Rows of an evaluation's table that are kept."""
 SECTIONS = {
@@ -37,7 +39,7 @@ class Row(NamedTuple):
     """Cells with what the row is filtered by."""
 
     cells: list[Cell]
-    names: Mapping[str, str] = {}  # noqa: RUF012 - never changed
+    names: Mapping[str, str] = {}
     mark: str = ""
     """ "best", "failed" or "unfinished"; empty for any other row."""
 
@@ -75,7 +77,8 @@ def _recipe(recipe: Recipe) -> list[Cell]:
     return [
         Cell(recipe.game), Cell(recipe.name), Cell(str(len(recipe.runs)), len(recipe.runs)),
         Cell(f"{counts.starts:,}", counts.starts), Cell(f"{counts.collisions:,}", counts.collisions),
-        Cell(percent(counts.value), counts.value), Cell(interval(counts.interval), (counts.interval or (None, None))[1]),
+        Cell(percent(counts.value), counts.value),
+        Cell(interval(counts.interval), (counts.interval or (None, None))[1]),
         Cell(across, None if rates is None else rates.high),
         Cell(at, None if most is None else most.collisions / most.starts),
         Cell(over_seeds(recipe.excess), None if recipe.excess is None else recipe.excess.mean),
@@ -107,7 +110,9 @@ def _run(run: Run) -> list[Cell]:
     counts, most, above, steps = total(run.table), worst(run.table), excess(run.table), whole(run.content.get("steps"))
     at = NOT_AVAILABLE if most is None else f"{theta(most.theta)} {percent(most.collisions / most.starts)}"
     metrics = run.content.get("metrics")
-    errors = [sound(metrics.get(f"val/{name}_error")) if isinstance(metrics, dict) else None for name in ("value", "costate")]
+    errors = [
+        sound(metrics.get(f"val/{name}_error")) if isinstance(metrics, dict) else None for name in ("value", "costate")
+    ]
     spent = seconds(run, "total")
     played = bool(counts.starts)
     return [
@@ -116,43 +121,61 @@ def _run(run: Run) -> list[Cell]:
         Cell(NOT_AVAILABLE if steps is None else f"{steps:,}", steps),
         Cell(f"{counts.starts:,}", counts.starts),
         Cell(f"{counts.collisions:,}" if played else NOT_AVAILABLE, counts.collisions if played else None),
-        Cell(percent(counts.value), counts.value), Cell(interval(counts.interval), (counts.interval or (None, None))[1]),
+        Cell(percent(counts.value), counts.value),
+        Cell(interval(counts.interval), (counts.interval or (None, None))[1]),
         Cell(at, None if most is None else most.collisions / most.starts), Cell(signed(above), above),
         *(Cell(number(error, 4), error) for error in errors), Cell(number(spent, 0), spent),
     ]  # fmt: skip
 
 
 def generic(entries: Sequence[Mapping[str, Any]]) -> Table:
-    """Any list of mappings; columns in the order in which they turn up."""
-    columns = list(dict.fromkeys(str(key) for entry in entries[:ROWS] for key in entry))
-    heads = [column.replace("_", " ") for column in columns]
-    return Table(heads, [Row([value_cell(entry.get(column)) for column in columns]) for entry in entries[:ROWS]])
+    """Any list of mappings; columns in the order in which they turn up, those of mappings inside after their name."""
+    rows = [_flat(entry) for entry in entries[:ROWS]]
+    columns = list(dict.fromkeys(key for row in rows for key in row))
+    return Table(
+        columns, [Row([value_cell(row[key], key) if key in row else Cell("") for key in columns]) for row in rows]
+    )
 
 
-def value_cell(value: Any) -> Cell:
-    """Any JSON value."""
-    found = sound(value)
-    if found is not None:
-        text = f"{value:,}" if isinstance(value, int) else f"{found:.4g}"
-        return Cell(text, found)
+def _flat(entry: Mapping[str, Any]) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for key, value in entry.items():
+        name = str(key).replace("_", " ")
+        found |= (
+            {f"{name} {inner}": rest for inner, rest in _flat(value).items()}
+            if isinstance(value, dict)
+            else {name: value}
+        )
+    return found
+
+
+def value_cell(value: Any, column: str = "") -> Cell:
+    """Any JSON value; rates and their intervals as percentages, long lists by their length."""
+    found, last = sound(value), column.split(" ")[-1]
     if value is None:
         return Cell(NOT_AVAILABLE)
-    if isinstance(value, list) and value and all(sound(entry) is not None for entry in value):
-        return Cell(theta(value)[:LONGEST])
+    if found is not None:
+        text = f"{value:,}" if isinstance(value, int) else f"{found:.4g}"
+        return Cell(percent(found) if last == "rate" and 0 <= found <= 1 else text, found)
+    if isinstance(value, list):
+        numbers = [entry for entry in map(sound, value) if entry is not None]
+        if len(numbers) != len(value) or len(numbers) > LISTED:
+            return Cell(f"{len(value)} entries")
+        return Cell(interval((numbers[0], numbers[1])) if last == "interval" and len(numbers) == 2 else theta(numbers))
     text = value if isinstance(value, str) else json.dumps(value, sort_keys=True)
     return Cell(text if len(text) <= LONGEST else f"{text[:LONGEST]}…")
 
 
 def sections(run: Run) -> dict[str, Table]:
-    """Tables of the further results of a run, by heading; a single mapping is one of names and values."""
-    found = {}
+    """Tables of the further results of a run, by heading."""
+    found: dict[str, Table] = {}
     for key, heading in SECTIONS.items():
         content = run.content.get(key)
         if isinstance(content, dict) and content:
             lists = {name: entry for name, entry in content.items() if records(entry)}
             rest = {name: entry for name, entry in content.items() if name not in lists}
+            found |= {heading: generic([rest])} if rest else {}
             found |= {f"{heading}: {name}": generic(records(entry)) for name, entry in lists.items()}
-            found |= {heading: generic([{"entry": name, "value": entry} for name, entry in rest.items()])} if rest else {}
         elif records(content):
             found[heading] = generic(records(content))
     return found
@@ -164,12 +187,13 @@ def label_tables(runs: Sequence[Run]) -> list[tuple[str, int, Table]]:
     for run in runs:
         if label_statistics(run):
             shared.setdefault(json.dumps([run.game, label_statistics(run)], sort_keys=True), []).append(run)
-    return [(same[0].game, len(same), generic([_labels(e) for e in label_statistics(same[0])])) for same in shared.values()]
+    return [
+        (same[0].game, len(same), generic([_labels(e) for e in label_statistics(same[0])])) for same in shared.values()
+    ]
 
 
 def _labels(entry: Mapping[str, Any]) -> dict[str, Any]:
     status = entry.get("status")
-    counts = {name: count for name, count in status.items() if count} if isinstance(status, dict) else {}
+    counts = {name: count for name, count in status.items() if count != 0} if isinstance(status, dict) else {}
     rest = {key: value for key, value in entry.items() if key != "status"}
     return {"theta": rest.pop("theta", None), "starts": rest.pop("starts", None), **counts, **rest}
-

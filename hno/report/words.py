@@ -51,6 +51,18 @@ def rate(found: Rate) -> str:
     )
 
 
+def share(found: Rate) -> str:
+    """Collisions of starts, in short."""
+    return f"{found.collisions:,} of {found.starts:,}: {percent(found.value)}"
+
+
+def clearance(value: float | None) -> str:
+    """How close an episode came."""
+    if value is None:
+        return f"clearance {NOT_AVAILABLE}"
+    return f"{abs(value):.2f} m {'short of' if value > 0 else 'inside'} the collision radius"
+
+
 def over_seeds(found: Spread | None) -> str:
     """Mean with its t interval, or that there is one seed only."""
     if found is None:
@@ -58,7 +70,7 @@ def over_seeds(found: Spread | None) -> str:
     if found.interval is None:
         return f"{signed(found.mean)} (one seed)"
     low, high = found.interval
-    return f"{signed(found.mean)} ({signed(low)} to {signed(high)}, {found.count} seeds)"
+    return f"{signed(found.mean)} ({signed(low)} to {signed(high)}, {found.seeds} seeds)"
 
 
 def seeds(recipe: Recipe) -> str:
@@ -87,12 +99,9 @@ def quality(found: Rate) -> str:
     return "safe" if found.collisions == 0 else ("rare" if found.value <= 0.01 else "unsafe")
 
 
-def verdicts(recipes: Sequence[Recipe]) -> dict[str, list[str]]:
-    """Sentences about the best recipe of every game."""
-    found: dict[str, list[str]] = {}
-    for (game, conditions), recipe in best(recipes).items():
-        found.setdefault(game, []).append(_verdict(recipe, conditions, recipes))
-    return found
+def verdicts(recipes: Sequence[Recipe]) -> list[tuple[str, Recipe, str]]:
+    """Game, its best recipe and a judgement of it, for every game and conditions of play."""
+    return [(game, one, _verdict(one, conditions, recipes)) for (game, conditions), one in best(recipes).items()]
 
 
 def _verdict(recipe: Recipe, conditions: str, recipes: Sequence[Recipe]) -> str:

@@ -1,4 +1,4 @@
-"""Folders as train.py leaves them, with made-up numbers: `python -m tests.report.folders <folder> <runs>` writes a sweep."""
+"""Folders as train.py leaves them, with made-up numbers: `python -m tests.report.folders <folder> <runs>`."""
 
 from __future__ import annotations
 
@@ -74,11 +74,12 @@ def make_results(
     config = {
         "game": {"name": game, "constants": {}}, "operator": {"name": operator, "width": 64, "depth": 4},
         "activation": {"name": activation}, "optimizer": {"name": "soap", "lr": 0.003}, "seed": seed,
-        "trainer": {"max_steps": 2000, "threads": 1}, "data": {"types": [list(t) for t in sorted(CORNERS)], "cache": None},
+        "trainer": {"max_steps": 2000, "threads": 1},
+        "data": {"types": [list(t) for t in sorted(CORNERS)], "cache": None},
     }  # fmt: skip
     return {
         "schema": 2, "status": "finished", "reason": None, "game": game, "operator": operator, "activation": activation,
-        "seed": seed, "steps": 2000, "config_hash": f"{abs(hash((game, operator))):016x}"[:16], "checkpoint": "best.ckpt",
+        "seed": seed, "steps": 2000, "config_hash": "0" * 16, "checkpoint": "best.ckpt",
         "seconds": {"labels": 36.0, "training": round(50 + 20 * rng.random(), 1), "validation": 6.0, "evaluation": 8.0},
         "metrics": {"loss/total": 0.05, "val/value_error": 0.02, "val/costate_error": 0.04},
         "validation": {"collision_rate": 0.0, "excess": -0.008}, "config": config,
@@ -107,11 +108,16 @@ def write_run(folder: Path, results: dict[str, Any], *, steps: int = 40, extras:
     if not extras:
         return folder
     rng = np.random.default_rng(list(str(folder).encode()))
-    lines = ["closed_loop/collision_rate,epoch,loss/costate,loss/total,loss/value,step,val/costate_error,val/value_error"]
+    lines = [
+        "closed_loop/collision_rate,epoch,loss/costate,loss/total,loss/value,step,val/costate_error,val/value_error"
+    ]
     pace = {"tanh": 8, "sin": 9, "relu": 13}.get(results["activation"], 9)
     for k in range(steps):
         step = (k + 1) * 50 - 1
-        value, costate = (math.exp(-k / pace) + 0.02) * rng.uniform(0.9, 1.1), (math.exp(-k / pace / 1.3) + 0.04) * rng.uniform(0.9, 1.1)
+        value, costate = (
+            (math.exp(-k / pace) + 0.02) * rng.uniform(0.9, 1.1),
+            (math.exp(-k / pace / 1.3) + 0.04) * rng.uniform(0.9, 1.1),
+        )
         lines.append(f",0,{costate},{value + costate},{value},{step},,")
         if k % 8 == 7:
             lines.append(f"{max(0.0, 0.5 - k / 50)},0,,,,{step},{costate},{value}")
@@ -146,7 +152,12 @@ def write_sweep(root: Path, count: int, *, types: Any = GRID5) -> Path:
             results |= {"status": "running", "table": [], "episodes": None}
         write_run(root / f"{job}_{game}_{operator}_{activation}", results)
     seeds = ",".join(str(seed) for seed in range(-(-count // len(recipes))))
-    task = [f"game={','.join(GAMES)}", f"operator={','.join(OPERATORS)}", f"activation={','.join(ACTIVATIONS)}", f"seed={seeds}"]
+    task = [
+        f"game={','.join(GAMES)}",
+        f"operator={','.join(OPERATORS)}",
+        f"activation={','.join(ACTIVATIONS)}",
+        f"seed={seeds}",
+    ]
     lines = ["hydra:", "  job:", "    name: train", "  overrides:", "    task:", *(f"    - {entry}" for entry in task)]
     (root / "multirun.yaml").write_text("\n".join(lines) + "\n")
     return root

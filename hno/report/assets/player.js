@@ -71,7 +71,8 @@ async function scene(episode, name, up) {
   const wide = Math.max(200, host.clientWidth - 52);
   const whole = extent(episode, up);
   const needed = (wide * (whole.y[1] - whole.y[0])) / (whole.x[1] - whole.x[0]);
-  const high = Math.max(Math.min(wide * 0.42, 260), Math.min(needed, 360));
+  const solid = episode.positions[0].length === 3;
+  const high = solid ? Math.min(wide * 0.66, 340) : Math.max(Math.min(wide * 0.42, 260), Math.min(needed, 360));
   const data = {
     path: rowsOf(episode, episode.positions, up),
     ghost: episode.ghost ? rowsOf(episode, episode.ghost, up) : [],
