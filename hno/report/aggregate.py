@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import statistics
 from collections import defaultdict
@@ -36,7 +37,12 @@ class Rate(NamedTuple):
     @property
     def interval(self) -> tuple[float, float] | None:
         """Clopper-Pearson interval, episodes taken as independent; None without starts."""
-        return clopper_pearson(self.collisions, self.starts, CONFIDENCE)
+        return _interval(self.collisions, self.starts)
+
+
+@functools.cache
+def _interval(collisions: int, starts: int) -> tuple[float, float] | None:
+    return clopper_pearson(collisions, starts, CONFIDENCE)
 
 
 class Spread(NamedTuple):

@@ -204,6 +204,7 @@ def version() -> str:
     return ".".join(alt.SCHEMA_VERSION.removeprefix("v").split(".")[:2])
 
 
+@functools.cache
 def library() -> str:
     """Vega-Embed, with Vega inside, as one script that defines `window.vegaEmbed`."""
     return vl_convert.javascript_bundle("window.vegaEmbed = vegaEmbed;", vl_version=version())

@@ -77,7 +77,10 @@ def collision_figure(found: Sequence[Recipe]) -> alt.ConcatChart | None:
         )
         for recipe in shown
     ]
-    return alt.concat(*maps, columns=math.isqrt(len(maps) - 1) + 1, spacing=30) if maps else None
+    if not maps:
+        return None
+    title = alt.TitleParams(f"{shown[0].game}: collisions of safe starts in %; framed: types with training labels")
+    return alt.concat(*maps, columns=math.isqrt(len(maps) - 1) + 1, spacing=30, title=title)
 
 
 def _inline(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import json
 import math
@@ -23,12 +24,15 @@ OPERATORS = ("hno", "sno")
 ACTIVATIONS = ("tanh", "sin", "relu")
 
 
+interval = functools.cache(clopper_pearson)
+
+
 def row(theta: tuple[float, ...], collisions: int, starts: int = STARTS, **entries: Any) -> dict[str, Any]:
     """A row of the collision table."""
     return {
         "theta": list(theta), "seen": theta in CORNERS, "starts": starts, "unsolved": 0, "inevitable": 0, "marginal": 0,
         "marginal_collisions": 0, "safe_starts": starts, "collisions": collisions,
-        "rate": collisions / starts if starts else None, "interval": clopper_pearson(collisions, starts),
+        "rate": collisions / starts if starts else None, "interval": interval(collisions, starts),
         "median_min_distance": 2.0 if starts else None, "median_excess_cost": 0.1 if starts else None,
         "median_label_cost": 10.0 if starts else None, **entries,
     }  # fmt: skip
@@ -66,7 +70,7 @@ def make_results(
     game: str, operator: str, activation: str, seed: int, rng: np.random.Generator, types: Any = GRID5, **entries: Any
 ) -> dict[str, Any]:
     """results.json of a finished run."""
-    level = {"tanh": 0.0008, "sin": 0.012, "relu": 0.12}[activation] * (0.6 if operator == "sno" else 1.3)
+    level = {"tanh": 0.0008, "sin": 0.012, "relu": 0.12}.get(activation, 0.01) * (0.6 if operator == "sno" else 1.3)
     table = []
     for theta in types:
         rate = min(0.9, level * (0.2 + (theta[0] + theta[1]) / 6) * (0.4 if theta in CORNERS else 1.5))
@@ -97,7 +101,9 @@ def make_results(
     }  # fmt: skip
 
 
-def write_run(folder: Path, results: dict[str, Any], *, steps: int = 40, extras: bool = True) -> Path:
+def write_run(
+    folder: Path, results: dict[str, Any], *, steps: int = 40, extras: bool = True, episode_types: int = 25
+) -> Path:
     """A run's folder: results, metrics, episodes and what Hydra writes."""
     (folder / ".hydra").mkdir(parents=True, exist_ok=True)
     (folder / "results.json").write_text(json.dumps(results))
@@ -107,7 +113,7 @@ def write_run(folder: Path, results: dict[str, Any], *, steps: int = 40, extras:
     (folder / ".hydra" / "hydra.yaml").write_text("hydra:\n  job:\n    name: train\n")
     if not extras:
         return folder
-    rng = np.random.default_rng(list(str(folder).encode()))
+    rng = np.random.default_rng(list(folder.name.encode()))
     lines = [
         "closed_loop/collision_rate,epoch,loss/costate,loss/total,loss/value,step,val/costate_error,val/value_error"
     ]
@@ -123,16 +129,16 @@ def write_run(folder: Path, results: dict[str, Any], *, steps: int = 40, extras:
             lines.append(f"{max(0.0, 0.5 - k / 50)},0,,,,{step},{costate},{value}")
     (folder / "csv").mkdir(exist_ok=True)
     (folder / "csv" / "metrics.csv").write_text("\n".join(lines) + "\n")
-    write_episodes(folder, results, rng)
+    write_episodes(folder, results, rng, episode_types)
     return folder
 
 
-def write_episodes(folder: Path, results: dict[str, Any], rng: np.random.Generator) -> None:
+def write_episodes(folder: Path, results: dict[str, Any], rng: np.random.Generator, episode_types: int) -> None:
     """episodes.json: the worst and a typical episode of every type."""
     game = results["game"]
     entries = [
         make_episode(game, tuple(entry["theta"]), kind, gap)
-        for entry in results["table"]
+        for entry in results["table"][:episode_types]
         for kind, gap in (("worst", -0.3 if entry["collisions"] else 0.02 + 0.1 * rng.random()), ("typical", 0.6))
     ]
     content = {"game": game, "players": 2, "dimensions": 3 if game == "drone" else 2, "episodes": entries}
@@ -150,7 +156,9 @@ def write_sweep(root: Path, count: int, *, types: Any = GRID5) -> Path:
             results |= {"status": "failed", "reason": "DivergedError: the loss is not finite at step 350.", "table": []}
         elif job == count - 2 and count > 2:
             results |= {"status": "running", "table": [], "episodes": None}
-        write_run(root / f"{job}_{game}_{operator}_{activation}", results)
+        write_run(
+            root / f"{job}_{game}_{operator}_{activation}", results, episode_types=25 if job < len(recipes) else 3
+        )
     seeds = ",".join(str(seed) for seed in range(-(-count // len(recipes))))
     task = [
         f"game={','.join(GAMES)}",
