@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -25,6 +26,8 @@ from hno.report.parsing import (
 T = TypeVar("T")
 
 RESULTS = "results.json"
+METRICS = "csv/metrics.csv"
+EPISODES = "episodes.json"
 SCHEMAS = (1, 2)
 """Versions of results.json that are known."""
 ENDED = ("finished", "failed")
@@ -107,7 +110,7 @@ def load(root: Path) -> Sweep:
     for folder in _candidates(root):
         name = root.resolve().name if folder == root else folder.relative_to(root).as_posix()
         try:
-            runs += read_runs(folder, name)
+            runs += _unchanged(folder, name, _stamp(folder))
         except UnreadableError as error:
             skipped.append(Skipped(name, str(error)))
     if not runs:
@@ -127,6 +130,18 @@ def _natural(path: Path) -> list[tuple[float, str]]:
     """Sorts 2_drone before 10_drone."""
     heads = [(part.split("_")[0], part) for part in path.parts]
     return [(float(head) if head.isdecimal() else math.inf, part) for head, part in heads]
+
+
+def _stamp(folder: Path) -> tuple[int, ...]:
+    """Changes whenever something that is read does."""
+    paths = (folder / name for name in (RESULTS, METRICS, EPISODES))
+    return tuple(path.stat().st_mtime_ns if path.exists() else 0 for path in paths)
+
+
+@functools.lru_cache(maxsize=1000)
+def _unchanged(folder: Path, name: str, stamp: tuple[int, ...]) -> list[Run]:
+    """Runs of a folder that has not changed since are not read again."""
+    return read_runs(folder, name)
 
 
 def read_runs(folder: Path, name: str) -> list[Run]:
@@ -164,7 +179,7 @@ def _run(folder: Path, name: str, content: Mapping[str, Any]) -> Run:
         content,
         tuple(_each(content.get("table"), type_result, "row of the table", notes)),
         _settings(folder, content, notes),
-        _curves(folder / "csv" / "metrics.csv", notes),
+        _curves(folder / METRICS, notes),
         tuple(_episodes(folder, content, notes)),
         command_of(folder),
         tuple(notes),

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import shutil
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -42,6 +44,13 @@ class Browser:
 
     def shown(self, selector: str) -> int:
         return self.page.locator(f"{selector}:visible").count()
+
+    def until(self, expression: str, seconds: float = 60) -> None:
+        """Wait for a condition; the page's security policy keeps Playwright from doing so inside."""
+        deadline = time.monotonic() + seconds
+        while not self.page.evaluate(expression):
+            assert time.monotonic() < deadline, f"never: {expression}"
+            time.sleep(0.02)
 
     def filter(self, **choices: str) -> None:
         for name, value in choices.items():
@@ -98,7 +107,7 @@ def test_filters_hide_what_does_not_match_and_live_in_the_address(browser):
     browser.page.reload()
     assert len(browser.rows("runs")) == 3
     browser.page.click("#filters button[type=reset]")
-    browser.page.wait_for_function("document.querySelector('#matching').textContent === '20 runs'")
+    browser.until("document.querySelector('#matching').textContent === '20 runs'")
 
 
 def test_a_seed_shows_single_runs_in_place_of_pooled_ones(browser):
@@ -124,8 +133,8 @@ def test_the_animation_plays_and_pauses(browser):
     page.select_option("#speed", "2")
     page.click("#play")
     assert page.get_attribute("#play", "aria-label") == "Pause"
-    page.wait_for_function("Number(document.querySelector('#scrub').value) > 5")
-    page.wait_for_function("document.querySelector('#play').getAttribute('aria-label') === 'Play'")
+    browser.until("Number(document.querySelector('#scrub').value) > 5")
+    browser.until("document.querySelector('#play').getAttribute('aria-label') === 'Play'")
     assert page.input_value("#scrub") == page.get_attribute("#scrub", "max")
 
 
@@ -148,7 +157,7 @@ def test_the_discs_move_and_turn_red_in_a_collision(browser):
         return page.evaluate(script)
 
     danger = page.evaluate("getComputedStyle(document.documentElement).getPropertyValue('--danger')").strip()
-    page.wait_for_function("document.querySelectorAll('#top .mark-symbol path').length > 0")
+    browser.until("document.querySelectorAll('#top .mark-symbol path').length > 0")
     far, near = fills(0), fills(25)
     assert danger not in far
     assert near == [danger, danger]
@@ -158,7 +167,7 @@ def test_the_keyboard_reaches_everything(browser):
     page = browser.page
     page.focus("#play")
     page.keyboard.press("Enter")
-    page.wait_for_function("document.querySelector('#play').getAttribute('aria-label') === 'Pause'")
+    browser.until("document.querySelector('#play').getAttribute('aria-label') === 'Pause'")
     page.keyboard.press("Enter")
     page.keyboard.press("Tab")
     before = int(page.input_value("#scrub"))
@@ -210,7 +219,7 @@ def test_a_watched_page_loads_itself_again_and_keeps_its_filters(context, small,
     write_page(sweep, path, 1.0)
     opened = Browser(context, path.as_uri() + "#game=drone")
     write_page(sweep._replace(name="renewed"), path, 1.0)
-    opened.page.wait_for_function("document.title.startsWith('renewed')")
+    playwright.expect(opened.page).to_have_title(re.compile("^renewed"), timeout=60_000)
     assert opened.page.input_value("#filters select[name=game]") == "drone"
     assert opened.said == []
     opened.page.close()
