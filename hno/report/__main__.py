@@ -58,17 +58,16 @@ def _report(chosen: argparse.Namespace) -> int:
             print(path)
         return 0
     page = chosen.folder / "report.html" if chosen.out is None else chosen.out
-    while True:
-        write_page(load(chosen.folder), page, chosen.watch)
-        if chosen.watch is None:
-            print(page)
-            return 0
-        print(f"{page} is up to date; the next look comes in {chosen.watch:g} s (Ctrl-C ends).", flush=True)
-        try:
+    try:
+        while chosen.watch is not None:
+            write_page(load(chosen.folder), page, chosen.watch)
+            print(f"{page} is up to date; the next look comes in {chosen.watch:g} s (Ctrl-C ends).", flush=True)
             time.sleep(chosen.watch)
-        except KeyboardInterrupt:
-            write_page(load(chosen.folder), page)
-            return 0
+    except KeyboardInterrupt:
+        pass  # the last page does not load itself again
+    write_page(load(chosen.folder), page)
+    print(page)
+    return 0
 
 
 if __name__ == "__main__":

@@ -39,7 +39,7 @@ def row(theta: tuple[float, ...], collisions: int, starts: int = STARTS, **entri
 
 
 def collision_radius(game: str, theta: tuple[float, ...]) -> float:
-    return 0.1 * sum(theta) + 0.05 * min(theta) + RADIUS[game]
+    return 0.1 * sum(theta) + 0.05 * min(theta) + RADIUS.get(game, 1.0)
 
 
 def make_episode(game: str, theta: tuple[float, ...], kind: str, gap: float, frames: int = 51) -> dict[str, Any]:

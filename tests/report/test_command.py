@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import os
-import signal
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -14,6 +12,7 @@ import numpy as np
 import pytest
 
 from hno.report.__main__ import main
+from hno.report.runs import load
 from tests.report.folders import GRID5, make_results, write_run
 
 RESULTS = make_results("drone", "sno", "tanh", 0, np.random.default_rng(0), GRID5[:2])
@@ -65,27 +64,32 @@ def test_a_missing_package_is_named_with_the_remedy(tmp_path, monkeypatch, capsy
     assert "altair: pip install 'hno[report]'" in capsys.readouterr().err
 
 
-def test_watching_follows_the_sweep_and_leaves_a_page_at_rest(tmp_path):
-    write_run(tmp_path / "0", RESULTS, extras=False)
-    page = tmp_path / "report.html"
-    command = [sys.executable, "-m", "hno.report", str(tmp_path), "--watch", "1"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=dict(os.environ))
-    try:
-        assert process.stdout is not None
-        assert "up to date" in process.stdout.readline()
-        assert "1 run:" in page.read_text()
-        assert "Refreshes every" in page.read_text()
+def test_watching_follows_the_sweep_and_leaves_a_page_at_rest(tmp_path, monkeypatch, capsys):
+    page, seen = tmp_path / "report.html", []
+
+    def sleep(seconds: float) -> None:
+        seen.append((seconds, page.read_text()))
+        if len(seen) == 2:
+            raise KeyboardInterrupt
         write_run(tmp_path / "1", {**RESULTS, "seed": 1}, extras=False)
-        deadline = time.monotonic() + 60
-        while "2 runs:" not in page.read_text():
-            assert time.monotonic() < deadline
-            time.sleep(0.2)
-        process.send_signal(signal.SIGINT)
-        assert process.wait(60) == 0
-    finally:
-        process.kill()
-        process.stdout.close()
+
+    write_run(tmp_path / "0", RESULTS, extras=False)
+    monkeypatch.setattr(time, "sleep", sleep)
+    assert main([str(tmp_path), "--watch", "7"]) == 0
+    assert [seconds for seconds, _ in seen] == [7.0, 7.0]
+    assert ["1 run: 1 finished" in text for _, text in seen] == [True, False]
+    assert "2 runs: 2 finished" in seen[1][1]
+    assert all("Refreshes every 7 s" in text for _, text in seen)
     assert "Refreshes every" not in page.read_text()
+    assert capsys.readouterr().out.splitlines()[-1] == str(page)
+
+
+def test_a_run_that_goes_on_is_read_again(tmp_path):
+    write_run(tmp_path / "0", {**RESULTS, "status": "running"}, extras=False)
+    assert load(tmp_path).runs[0].status == "running"
+    os.utime(tmp_path / "0" / "results.json", ns=(1, 1))
+    write_run(tmp_path / "0", RESULTS, extras=False)
+    assert load(tmp_path).runs[0].status == "finished"
 
 
 def test_the_assets_lie_inside_the_package():
