@@ -1,0 +1,165 @@
+/** Vega charts: drawn when they come into view, again when filters, width or colours change. */
+const dark = matchMedia("(prefers-color-scheme: dark)");
+const theme = () => DATA.themes[dark.matches && !("print" in document.documentElement.dataset) ? "dark" : "light"];
+const [views, turns] = [new WeakMap(), new WeakMap()];
+const tip = $("tip");
+
+function showTip(_handler, event, _item, value) {
+  tip.hidden = !value;
+  if (!value) return;
+  tip.textContent = typeof value === "string" ? value : Object.values(value).join("\n");
+  const { width, height } = tip.getBoundingClientRect();
+  tip.style.left = `${Math.max(8, Math.min(event.clientX + 14, innerWidth - width - 8))}px`;
+  tip.style.top = `${event.clientY + height + 22 < innerHeight ? event.clientY + 16 : event.clientY - height - 12}px`;
+}
+addEventListener("scroll", () => (tip.hidden = true), { passive: true });
+
+/**
+ * Draw a chart into an element.
+ * @param data rows by data set name.
+ * @param values width, height and values of signals by name.
+ * @returns a promise of the view, or of null where another drawing has come in between.
+ */
+async function draw(host, name, data, values = {}, renderer = "svg") {
+  const turn = (turns.get(host) ?? 0) + 1;
+  turns.set(host, turn);
+  const { config, signals } = theme();
+  const specification = structuredClone(DATA.charts[name]);
+  const given = { ...signals, ...values };
+  for (const signal of specification.signals) if (signal.name in given) signal.value = given[signal.name];
+  for (const side of ["width", "height"]) if (side in values) specification[side] = values[side];
+  for (const set of specification.data) if (set.name in data) set.values = data[set.name];
+  const box = element("div");
+  const options = { mode: "vega", config, renderer, ast: true, actions: false, defaultStyle: false, tooltip: showTip };
+  views.get(host)?.finalize();
+  host.replaceChildren(box);
+  const made = await vegaEmbed(box, specification, options);
+  if (turns.get(host) !== turn) {
+    made.finalize();
+    return null;
+  }
+  views.set(host, made);
+  return made.view;
+}
+
+/** Values of one axis of the type space, in order. */
+const axis = (cells, player) => [...new Set(cells.map(([theta]) => theta[player]))].sort((a, b) => a - b);
+
+function drawHeat(host) {
+  const which = $("shown").value;
+  const cells = DATA.maps[host.dataset.of];
+  const [first, second] = [axis(cells, 0), axis(cells, 1)];
+  const known = new Map(cells.map((cell) => [cell[0].join(), cell]));
+  const step = Math.max(13, Math.min(38, Math.floor((host.clientWidth - 44) / first.length)));
+  const rows = second.flatMap((b) => first.map((a) => heatCell(known.get([a, b].join()), a, b, which, step)));
+  draw(host, "heat", { cells: rows }, { x_step: step, y_step: step });
+}
+
+function heatCell(cell, a, b, which, step) {
+  const names = { theta_1: a, theta_2: b };
+  if (!cell) return { ...names, shown: undefined, label: "", seen: false, tip: `types ${types([a, b])}\nnot evaluated` };
+  const [theta, hits, starts, seen, excess] = cell;
+  const bounds = DATA.intervals[`${hits}/${starts}`];
+  const rate = starts ? hits / starts : null;
+  const shown = which === "rate" || !bounds ? rate : bounds[1];
+  const label = shown === null ? "–" : shown === 0 ? "0" : step < 20 ? "" : (100 * shown).toFixed(shown < 0.0995 ? 1 : 0);
+  const tip = [
+    `types ${types(theta)}, ${seen ? "seen in training" : "without training labels"}`,
+    starts ? `${hits} of ${starts} safe starts collide: ${percent(rate)}` : "no safe start: rate n/a",
+    bounds ? `95 % interval ${percent(bounds[0])} to ${percent(bounds[1])}` : "",
+    excess === null ? "" : `median excess cost ${excess < 0 ? "" : "+"}${(100 * excess).toFixed(1)} %`,
+  ];
+  return { ...names, shown, label, seen: Boolean(seen), tip: tip.filter(Boolean).join("\n") };
+}
+
+function drawComparison(host) {
+  const rows = DATA.comparison.filter((row) => row.game === host.dataset.of && (row.seed === null || matches(row)));
+  draw(host, "comparison", { recipes: rows.filter((row) => matches({ ...row, seed: undefined })) });
+}
+
+function drawCurves(host) {
+  const metric = $("metric").value;
+  const told = DATA.curves.filter((curve) => curve.game === host.dataset.of && curve.metrics[metric] && matches(curve));
+  const points = told.flatMap((curve) => {
+    const [steps, values] = curve.metrics[metric];
+    return steps.map((step, k) => ({
+      step, value: values[k], run: curve.run, recipe: curve.recipe || `${curve.operator} / ${curve.activation}`,
+      tip: `${curve.run}\nstep ${step}: ${values[k]}`,
+    }));
+  });
+  const scale = points.length && points.every((point) => point.value > 0) ? "log" : "linear";
+  draw(host, scale, { points }, {}, "canvas");
+}
+
+const kinds = { heat: drawHeat, comparison: drawComparison, curves: drawCurves };
+const pending = new Set(all("[data-chart]"));
+const visible = new Set();
+
+function drawPending(hosts) {
+  for (const host of hosts) {
+    if (!pending.has(host) || !host.clientWidth) continue;
+    pending.delete(host);
+    kinds[host.dataset.chart](host);
+  }
+}
+
+/** Draw charts of some kinds again: those in view now, the others when they come into view. */
+function redraw(...names) {
+  for (const host of all("[data-chart]")) if (names.includes(host.dataset.chart)) pending.add(host);
+  drawPending(visible);
+}
+
+const watcher = new IntersectionObserver(
+  (entries) => {
+    for (const entry of entries) visible[entry.isIntersecting ? "add" : "delete"](entry.target);
+    drawPending(visible);
+  },
+  { rootMargin: "300px" },
+);
+for (const host of pending) watcher.observe(host);
+
+const FIRST = 12;
+let unfolded = false;
+/** Shows the first heat maps, and the others on demand. */
+function foldMaps() {
+  const maps = all(".map").filter((map) => !map.hasAttribute("data-out"));
+  maps.forEach((map, k) => map.toggleAttribute("data-folded", !unfolded && k >= FIRST));
+  const more = $("more");
+  if (!more) return;
+  more.hidden = unfolded || maps.length <= FIRST;
+  more.textContent = `Show ${maps.length - FIRST} more heat maps`;
+}
+$("more")?.addEventListener("click", () => {
+  unfolded = true;
+  foldMaps();
+});
+listeners.push(foldMaps, () => redraw("comparison", "curves"));
+
+const metric = $("metric");
+if (metric) {
+  const names = [...new Set(DATA.curves.flatMap((curve) => Object.keys(curve.metrics)))].sort();
+  metric.append(...names.map((name) => element("option", { value: name, textContent: name })));
+  metric.value = ["closed_loop/collision_rate", "val/costate_error", "loss/total"].reduce((best, name) => (names.includes(name) ? name : best), names[0]);
+  metric.addEventListener("change", () => redraw("curves"));
+}
+$("shown")?.addEventListener("change", () => redraw("heat"));
+
+const everything = () => redraw(...Object.keys(kinds));
+let width = innerWidth;
+let later;
+addEventListener("resize", () => {
+  if (innerWidth === width) return;
+  width = innerWidth;
+  clearTimeout(later);
+  later = setTimeout(() => listeners.concat(everything).forEach((listener) => listener()), 150);
+});
+dark.addEventListener("change", () => listeners.concat(everything).forEach((listener) => listener()));
+addEventListener("beforeprint", () => {
+  document.documentElement.dataset.print = "";
+  everything();
+  drawPending([...pending]);
+});
+addEventListener("afterprint", () => {
+  delete document.documentElement.dataset.print;
+  everything();
+});

@@ -1,0 +1,225 @@
+"""The page in a real browser: it works, asks nobody for anything, and says nothing on the console."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from hno.report.page import write_page
+from hno.report.runs import load
+
+playwright = pytest.importorskip("playwright.sync_api", reason="needs the package playwright")
+CHROMIUM = shutil.which("chromium")
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs Debian's package chromium")
+
+ARGUMENTS = (
+    "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
+    "--disable-component-update", "--disable-sync",
+)  # fmt: skip
+
+
+class Browser:
+    """An open page, with what it said and asked for."""
+
+    def __init__(self, context, address: str) -> None:
+        self.page = context.new_page()
+        self.said: list[str] = []
+        self.asked: list[str] = []
+        self.page.on("console", lambda message: self.said.append(message.text))
+        self.page.on("pageerror", lambda error: self.said.append(str(error)))
+        self.page.on("request", lambda request: self.asked.append(request.url))
+        self.address = address
+        self.page.goto(address)
+
+    def rows(self, section: str) -> list[list[str]]:
+        """Cells of the rows that are shown."""
+        script = """section => [...document.querySelectorAll(`#${section} tbody tr`)].filter(row => row.offsetParent)
+            .map(row => [...row.cells].map(cell => cell.textContent))"""
+        return self.page.evaluate(script, section)
+
+    def shown(self, selector: str) -> int:
+        return self.page.locator(f"{selector}:visible").count()
+
+    def until(self, expression: str, seconds: float = 60) -> None:
+        """Wait for a condition; the page's security policy keeps Playwright from doing so inside."""
+        deadline = time.monotonic() + seconds
+        while not self.page.evaluate(expression):
+            assert time.monotonic() < deadline, f"never: {expression}"
+            time.sleep(0.02)
+
+    def filter(self, **choices: str) -> None:
+        for name, value in choices.items():
+            self.page.select_option(f"#filters select[name={name}]", value)
+
+
+@pytest.fixture(scope="module")
+def address(small, tmp_path_factory) -> str:
+    path = tmp_path_factory.mktemp("page") / "report.html"
+    write_page(load(small), path)
+    return path.as_uri()
+
+
+@pytest.fixture(scope="module")
+def context(tmp_path_factory):
+    with playwright.sync_playwright() as started:
+        opened = started.chromium.launch_persistent_context(
+            tmp_path_factory.mktemp("profile"), executable_path=CHROMIUM, args=list(ARGUMENTS), headless=True
+        )
+        opened.set_default_timeout(60_000)
+        yield opened
+        opened.close()
+
+
+@pytest.fixture
+def browser(context, address) -> Iterator[Browser]:
+    opened = Browser(context, address)
+    yield opened
+    assert opened.said == []
+    assert {url.split(":")[0] for url in opened.asked} <= {"file", "data"}
+    assert [url for url in opened.asked if url.startswith("file")] == [opened.address] * opened.asked.count(
+        opened.address
+    )
+    opened.page.close()
+
+
+def test_everything_is_drawn_without_a_word_or_a_request(browser):
+    page = browser.page
+    for chart in ("heat", "comparison", "curves"):
+        plot = page.locator(f"[data-chart={chart}]:visible").first
+        plot.scroll_into_view_if_needed()
+        plot.locator("svg, canvas").wait_for()
+    page.locator("#top svg").wait_for(state="attached")
+
+
+def test_filters_hide_what_does_not_match_and_live_in_the_address(browser):
+    assert len(browser.rows("runs")) == 20
+    browser.filter(game="drone", operator="sno")
+    assert {tuple(row[2:4]) for row in browser.rows("runs")} == {("drone", "sno")}
+    assert {row[0] for row in browser.rows("recipes")} == {"drone"}
+    assert browser.shown(".game") == 1
+    assert browser.shown(".map") == 3
+    assert "of 20 runs" in browser.page.inner_text("#matching")
+    browser.page.reload()
+    assert len(browser.rows("runs")) == 3
+    browser.page.click("#filters button[type=reset]")
+    browser.until("document.querySelector('#matching').textContent === '20 runs'")
+
+
+def test_a_seed_shows_single_runs_in_place_of_pooled_ones(browser):
+    pooled = browser.page.locator(".map:visible").first.inner_text()
+    browser.filter(seed="0", game="narrow_road")
+    assert "seed 0" in browser.page.locator(".map:visible").first.inner_text()
+    assert "seed 0" not in pooled
+
+
+def test_a_column_sorts_by_value_with_missing_numbers_last(browser):
+    head = browser.page.locator("#runs th button", has_text="collisions")
+    for order, sign in (("ascending", 1), ("descending", -1)):
+        head.click()
+        assert head.locator("..").get_attribute("aria-sort") == order
+        texts = [row[8] for row in browser.rows("runs")]
+        numbers = [int(text.replace(",", "")) for text in texts if text != "n/a"]
+        assert numbers == sorted(numbers, key=lambda number: sign * number)
+        assert texts[-2:] == ["n/a", "n/a"]
+
+
+def test_the_animation_plays_and_pauses(browser):
+    page = browser.page
+    page.select_option("#speed", "2")
+    page.click("#play")
+    assert page.get_attribute("#play", "aria-label") == "Pause"
+    browser.until("Number(document.querySelector('#scrub').value) > 5")
+    browser.until("document.querySelector('#play').getAttribute('aria-label') === 'Play'")
+    assert page.input_value("#scrub") == page.get_attribute("#scrub", "max")
+
+
+def test_the_discs_move_and_turn_red_in_a_collision(browser):
+    page = browser.page
+    page.select_option(
+        "#episode", label=next(t for t in page.locator("#episode option").all_inner_texts() if "collision" in t)
+    )
+    page.locator("#top svg").wait_for()
+
+    def fills(frame: int) -> list[str]:
+        page.evaluate(
+            """frame => { const scrub = document.querySelector('#scrub');
+            scrub.value = frame; scrub.dispatchEvent(new Event('input')); }""",
+            frame,
+        )
+        page.wait_for_timeout(100)
+        script = """[...document.querySelectorAll('#top .mark-symbol path')]
+            .filter(disc => disc.getBoundingClientRect().width > 9).map(disc => disc.getAttribute('fill'))"""
+        return page.evaluate(script)
+
+    danger = page.evaluate("getComputedStyle(document.documentElement).getPropertyValue('--danger')").strip()
+    browser.until("document.querySelectorAll('#top .mark-symbol path').length > 0")
+    far, near = fills(0), fills(25)
+    assert danger not in far
+    assert near == [danger, danger]
+
+
+def test_the_keyboard_reaches_everything(browser):
+    page = browser.page
+    page.focus("#play")
+    page.keyboard.press("Enter")
+    browser.until("document.querySelector('#play').getAttribute('aria-label') === 'Pause'")
+    page.keyboard.press("Enter")
+    page.keyboard.press("Tab")
+    before = int(page.input_value("#scrub"))
+    page.keyboard.press("ArrowRight")
+    assert int(page.input_value("#scrub")) == before + 1
+    page.focus("#recipes th button")
+    page.keyboard.press("Space")
+    assert page.locator("#recipes th").first.get_attribute("aria-sort") == "ascending"
+    page.locator(".map:visible summary").first.press("Enter")
+    page.locator(".map:visible table").first.wait_for()
+    page.focus("#play")
+    assert page.evaluate("getComputedStyle(document.activeElement).outlineStyle") != "none"
+
+
+def test_numbers_under_a_heat_map_are_those_of_the_tooltip(browser):
+    page = browser.page
+    card = page.locator(".map:visible").first
+    card.locator("summary").click()
+    first = card.locator("tbody tr").first.inner_text()
+    cell = card.locator(".mark-rect path").first
+    card.locator("svg").wait_for()
+    cell.hover(force=True)
+    page.wait_for_selector("#tip:not([hidden])")
+    text = page.inner_text("#tip")
+    assert "safe starts collide" in text
+    assert " of 200" in first
+
+
+@pytest.mark.parametrize("width", [390, 1280])
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_it_fits_the_width_in_light_and_in_dark(browser, width, scheme, tmp_path):
+    page = browser.page
+    page.emulate_media(color_scheme=scheme)
+    page.set_viewport_size({"width": width, "height": 900})
+    page.reload()
+    page.locator("#top svg").wait_for(state="attached")
+    assert page.evaluate("document.documentElement.scrollWidth") == width
+    paper = page.evaluate("getComputedStyle(document.body).backgroundColor")
+    bright = sum(int(part) for part in paper[4:-1].split(",")) > 3 * 128
+    assert bright == (scheme == "light")
+    picture = tmp_path / f"{width}_{scheme}.png"
+    page.screenshot(path=picture, full_page=True)
+    assert picture.stat().st_size > 50_000
+
+
+def test_a_watched_page_loads_itself_again_and_keeps_its_filters(context, small, tmp_path: Path):
+    path = tmp_path / "report.html"
+    sweep = load(small)
+    write_page(sweep, path, 1.0)
+    opened = Browser(context, path.as_uri() + "#game=drone")
+    write_page(sweep._replace(name="renewed"), path, 1.0)
+    playwright.expect(opened.page).to_have_title(re.compile("^renewed"), timeout=60_000)
+    assert opened.page.input_value("#filters select[name=game]") == "drone"
+    assert opened.said == []
+    opened.page.close()

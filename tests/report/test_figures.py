@@ -1,0 +1,77 @@
+"""Figures and tables for documents."""
+
+from __future__ import annotations
+
+import json
+import xml.etree.ElementTree as ET
+
+import numpy as np
+import pytest
+
+from hno.report.aggregate import recipes
+from hno.report.figures import markdown, summary, write_figures
+from hno.report.kernels import condition_table
+from hno.report.runs import load
+from tests.report.folders import GRID5, make_results, row, write_run
+
+
+def results(activation="tanh", **entries):
+    return make_results("drone", "sno", activation, 0, np.random.default_rng(0), GRID5) | entries
+
+
+def test_a_figure_of_every_kind_is_drawn_twice(tmp_path):
+    write_run(tmp_path / "run", results())
+    written = write_figures(load(tmp_path / "run"), tmp_path / "figures")
+    views = [f"encounter_drone_{kind}_{view}" for kind in ("worst", "typical") for view in ("top", "side")]
+    drawn = {
+        f"{name}.{suffix}" for name in ("collisions_drone", "comparison_drone", *views) for suffix in ("svg", "png")
+    }
+    assert {path.name for path in written} == drawn | {"summary.md", "summary.json"}
+    for path in written:
+        assert path.stat().st_size > 0
+        if path.suffix == ".svg":
+            assert ET.parse(path).getroot().tag.endswith("svg")
+    text = (tmp_path / "figures" / "collisions_drone.svg").read_text()
+    assert "framed: types with training labels" in text
+
+
+def test_the_summary_repeats_the_counts(tmp_path):
+    table = [row((1.0, 1.0), 3, 100), row((5.0, 5.0), 0, 50)]
+    write_run(tmp_path / "0", results(table=table), extras=False)
+    write_run(tmp_path / "1", results(table=[], status="failed", reason="a | b\n<i>", seed=1), extras=False)
+    sweep = load(tmp_path)
+    found = recipes(sweep.runs)
+    content = json.loads(summary(sweep, found))
+    (recipe,) = content["recipes"]
+    assert (recipe["collisions"], recipe["starts"], recipe["failed"]) == (3, 150, 1)
+    assert recipe["types"][0]["theta"] == [1.0, 1.0]
+    assert content["missing"][0]["reason"] == "a | b\n<i>"
+    text = markdown(sweep, found)
+    assert "| drone | sno / tanh | 1 | 150 | 3 | 2.00 % |" in text
+    assert "3 of 150" in text
+
+
+def kernel(condition, rank=8):
+    return {"rows": 8, "cutoff": 1e-12, "rank": rank, "condition": condition, "effective_rank": 2.0, "curve": []}
+
+
+@pytest.mark.parametrize(
+    ("tanh", "sin", "ratio"),
+    [
+        (kernel(600.0), kernel(200.0), "3"),
+        (kernel(9e11, rank=5), kernel(1e10), "> 100"),
+        (kernel(1e10), kernel(9e11, rank=5), "< 0.01"),
+        (kernel(1.0, rank=5), kernel(1.0, rank=5), "n/a"),
+        (kernel(600.0), None, "n/a"),
+    ],
+)
+def test_ratios_of_condition_numbers_are_bounds_where_a_kernel_is_cut_off(tmp_path, tanh, sin, ratio):
+    for activation, found in (("tanh", tanh), ("sin", sin), ("relu", kernel(50.0))):
+        section = [{"theta": [1.0, 1.0], "reason": None, "points": 4, "kernel": found, "product": None}]
+        write_run(tmp_path / activation, results(activation, ntk=section), extras=False)
+    table = condition_table(load(tmp_path).runs)
+    (line,) = table.rows
+    cells = dict(zip(table.columns, (cell.text for cell in line.cells), strict=True))
+    assert cells["kernel"] == "J J'"
+    assert cells.get("tanh / sin", "n/a") == ratio
+    assert cells["tanh / relu"] != "n/a"
