@@ -1,6 +1,6 @@
 """Plays the runs of a sweep where they were not trained: other boxes, types, noise, delay.
 
-    python benchmarks/suites.py multirun/<date>/<time> [--suites "half types" "2 x box" noise delay] [--games lane_change]
+    python benchmarks/suites.py multirun/<date>/<time> [--suites "half types" "2 x box" noise] [--games lane_change]
 
 Suites are in recipe_sets.py; all count starts whose equilibrium keeps 2 cm. What was played before is kept as
 `suites.json` in each run's folder. Prints a table per game, one line for every operator and activation, with counts
