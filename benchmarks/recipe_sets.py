@@ -44,7 +44,7 @@ MOST = {"half types": 256, "beyond": 512, "1.5 x box": 256, "2 x box": 256}
 """Start states of a type after which the search for safe ones ends, where it is not 4096."""
 
 CORNERS = "data.types=[[1,1],[1,5],[5,1],[5,5]]"
-STEPS = "trainer.max_steps=1000 optimizer.lr=1e-2"
+STEPS = "activation=tanh trainer.max_steps=1000 optimizer.lr=1e-2"
 SHORT = f"operator=sno {STEPS}"
 FIFTEEN = str([[a, b] for a, b in itertools.combinations_with_replacement(range(1, 6), 2)]).replace(" ", "")
 TEN = f"{STEPS} {CORNERS} data.trajectories=10"
@@ -70,7 +70,7 @@ RECIPES: dict[str, dict[str, str]] = {
         for name, rates in {
             "tanh": (1e-3, 3e-3, 1e-2, 3e-2),
             "relu": (3e-3, 1e-2, 3e-2),
-            "sin": (3e-4, 1e-3, 3e-3),
+            "sin activation.frequency=30": (3e-4, 1e-3, 3e-3),
             "sin activation.frequency=10": (1e-3, 3e-3, 1e-2),
             "sin activation.frequency=3": (3e-3, 1e-2, 3e-2),
         }.items()

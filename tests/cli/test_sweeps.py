@@ -125,7 +125,7 @@ def grid(command: Command, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> I
 
 
 def test_the_papers_grid_takes_every_activation_at_its_own_rate(grid: Any) -> None:
-    rates = {"tanh": 3e-3, "sin": 3e-4, "relu": 3e-3}
+    rates = {"tanh": 3e-3, "sin": 3e-3, "relu": 1e-2}
     starts = {"narrow_road": 200, "lane_change": 200, "drone": 60}
     assert grid("-m", "seed=1") == [
         (game, operator, activation, 1, rates[activation], starts[game], True, 25, 2000)
@@ -139,7 +139,7 @@ def test_the_command_line_narrows_the_grid(grid: Any) -> None:
 
 
 def test_one_cell_of_the_grid(grid: Any) -> None:
-    assert grid("activation=sin") == [("narrow_road", "sno", "sin", 0, 3e-4, 200, True, 25, 2000)]
+    assert grid("activation=relu") == [("narrow_road", "sno", "relu", 0, 1e-2, 200, True, 25, 2000)]
 
 
 def test_games_and_activations_of_ones_own_have_a_place_in_the_grid(grid: Any) -> None:

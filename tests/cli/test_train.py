@@ -95,7 +95,7 @@ def test_results_hold_every_part_of_the_run(command: Command) -> None:
 def test_run_says_what_happened(command: Command) -> None:
     run = command("train", *SMOKE, "trainer.max_steps=4", "trainer.print_every=2")
     assert "step 2 of 4" in run.text
-    assert "narrow_road / hno / tanh" in run.text
+    assert "narrow_road / hno / sin" in run.text
     assert str(run.folder / "results.json") in run.text.replace("\n", "")
     log = (run.folder / "train.log").read_text()
     assert "step 4 of 4" in log
@@ -214,7 +214,7 @@ def test_one_failed_job_of_a_multirun_fails_the_command_but_not_the_others(comma
     sweep = f"hydra.sweep.dir={tmp_path}/sweep"
     run = command("train", "-m", sweep, *SMOKE, "trainer.max_steps=2", "optimizer.lr=inf,0.001,0.002")
     assert run.code == 1
-    jobs = [Outcome(0, "", folder) for folder in sorted((tmp_path / "sweep").glob("*_narrow_road_hno_tanh"))]
+    jobs = [Outcome(0, "", folder) for folder in sorted((tmp_path / "sweep").glob("*_narrow_road_hno_sin"))]
     assert [job.results["status"] for job in jobs] == ["failed", "finished", "finished"]
 
 
