@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import re
 import sys
@@ -11,14 +12,19 @@ from typing import Any
 
 import hydra
 from hydra.core.config_store import ConfigStore
+from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from omegaconf import DictConfig
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
 import hno
+from hno.cli.results import Results
+from hno.cli.sweep import Job, show_jobs
 from hno.games import games
 from hno.operators import activations, operators
 from hno.registry import Registry, unknown_name
+
+log = logging.getLogger(__name__)
 
 PLUGGABLE: dict[str, Registry[Any]] = {"game": games, "operator": operators, "activation": activations}
 """Groups whose choices are registered classes."""
@@ -81,6 +87,8 @@ def explain(error: Exception) -> str:
 def run_command(config_name: str, task: Callable[[DictConfig], bool]) -> None:
     """Run a task under Hydra, in every job of a multirun, and exit with 1 if one of them failed.
 
+    A multirun ends with a table of its jobs, also when it is interrupted.
+
     Args:
         config_name: the root configuration.
         task: does one job; false if it failed (it has said why).
@@ -89,10 +97,13 @@ def run_command(config_name: str, task: Callable[[DictConfig], bool]) -> None:
     sys.argv[1:] = [re.sub(r"^theta=([^'\"]*[,;].*)$", r"theta='\1'", argument) for argument in sys.argv[1:]]
     register_plugins()
     outcomes: list[bool] = []
+    jobs: list[Job] = []
     os.environ["HYDRA_FULL_ERROR"] = "1"  # exceptions reach this function; it says what they mean
 
     def job(config: DictConfig) -> None:
-        outcomes.append(task(config))
+        current = Job.current()
+        jobs.extend([] if current is None else [current])
+        outcomes.append(_attempt(task, config))
 
     try:
         hydra.main(version_base="1.3", config_path=str(config_dir()), config_name=config_name)(job)()
@@ -100,5 +111,21 @@ def run_command(config_name: str, task: Callable[[DictConfig], bool]) -> None:
         sys.exit(f"The output folder cannot be written ({error}). Choose another with hydra.run.dir=<folder>.")
     except (HydraException, OmegaConfBaseException) as error:
         sys.exit(explain(error))
+    finally:
+        if jobs:
+            show_jobs(jobs)
     if not all(outcomes):
         sys.exit(1)
+
+
+def _attempt(task: Callable[[DictConfig], bool], config: DictConfig) -> bool:
+    """Run a task; a configuration that cannot be resolved is a failure of its own, not of the jobs after it."""
+    try:
+        return task(config)
+    except OmegaConfBaseException as error:
+        hydra_config = HydraConfig.get()
+        chosen = {group: hydra_config.runtime.choices.get(group) for group in PLUGGABLE}
+        path = Path(hydra_config.runtime.output_dir) / "results.json"
+        Results(path, chosen).update(status="failed", reason=explain(error))
+        log.error("%s", explain(error))
+        return False

@@ -1,32 +1,35 @@
-"""`python evaluate.py checkpoint=<path>`: the collision table of a trained model."""
+"""`python evaluate.py checkpoint=<path>`: how safe trained models are, and where they err."""
 
 from __future__ import annotations
 
-import functools
 import logging
 import math
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
+from torch import Tensor
 
 from hno.cli.build import cache_folder
 from hno.cli.config import run_command
-from hno.cli.logs import label_progress, send_lightning_to_hydra
+from hno.cli.logs import send_lightning_to_hydra
 from hno.cli.results import Results, config_hash, plain, write_json
+from hno.cli.sections import check_sections, run_sections
+from hno.cli.starts import solve_starts
 from hno.cli.summary import report, show
-from hno.data.labels import Request, labels_for, safe_labels_for
-from hno.evaluation.closed_loop import TypeRow, play, table_of
+from hno.evaluation.closed_loop import TypeRow, classify, collided, play, tabulate
+from hno.evaluation.comparison import check_same_game, compare
 from hno.evaluation.episodes import EPISODES, episodes
 from hno.evaluation.rollout import Disturbance, control_steps, rollout
 from hno.games import Game
 from hno.games.grid import parse_types
 from hno.operators.checkpoint import OperatorPolicy, load_operator
 from hno.report.picture import PlotsMissingError, rollout_picture, typical
-from hno.types import Extremal
+from hno.types import Extremal, Trajectory
 
 log = logging.getLogger(__name__)
 
@@ -37,7 +40,7 @@ def main() -> None:
 
 
 def evaluate(config: DictConfig) -> bool:
-    """Evaluate one checkpoint and write results.json into the run's own folder.
+    """Evaluate checkpoints and write results.json into the run's own folder.
 
     Returns:
         Whether it succeeded. A failure has been logged and is in results.json.
@@ -47,10 +50,8 @@ def evaluate(config: DictConfig) -> bool:
         log.error("Say which checkpoint to evaluate: python evaluate.py checkpoint=<path to best.ckpt>")
         return False
     folder = Path(HydraConfig.get().runtime.output_dir)
-    results = Results(
-        folder / "results.json",
-        {"checkpoint": config.checkpoint, "config_hash": config_hash(config), "config": plain(config)},
-    )
+    head = {"checkpoint": checkpoints_of(config)[0], "config_hash": config_hash(config), "config": plain(config)}
+    results = Results(folder / "results.json", head)
     try:
         _run(config, results)
     except Exception as error:
@@ -64,15 +65,36 @@ def evaluate(config: DictConfig) -> bool:
     return True
 
 
+def checkpoints_of(config: DictConfig) -> list[str]:
+    """Paths of the models: one, or several of a list; an empty list names none."""
+    several = OmegaConf.is_list(config.checkpoint) and len(config.checkpoint) > 0
+    return [str(path) for path in config.checkpoint] if several else [str(config.checkpoint)]
+
+
 def _run(config: DictConfig, results: Results) -> None:
-    policy = OperatorPolicy(load_operator(config.checkpoint, config.expected_game))
-    operator = policy.operator
-    results.update(**operator.names())
-    check_evaluation(policy.game, config)
-    types = types_to_evaluate(config.theta, policy, config.unseen)
-    cache = cache_folder(config.cache)
-    labels = solve_tests(policy.game, types, config, cache, config.workers, results)
-    evaluate_policy(policy, labels, config, results)
+    paths = checkpoints_of(config)
+    policies = [OperatorPolicy(load_operator(path, config.expected_game)) for path in paths]
+    game = policies[0].game
+    results.update(**policies[0].operator.names())
+    check_same_game(paths, [policy.game for policy in policies])
+    check_evaluation(game, config)
+    chosen = [types_to_evaluate(config.theta, policy, config.unseen) for policy in policies]
+    types = list(dict.fromkeys(theta for own in chosen for theta in own))
+    for policy in policies:
+        check_sections(policy, types, config)
+    labels = solve_tests(game, types, config, cache_folder(config.cache), config.workers, results)
+    models, outcomes = list[dict[str, Any]](), list[Sequence[Tensor]]()
+    for path, policy in zip(paths, policies, strict=True):
+        log.info("evaluation of %s", path)
+        found = assess(policy, labels, config, results) if models else evaluate_policy(policy, labels, config, results)
+        outcomes.append(found.collided)
+        table = [row._asdict() for row in found.table]
+        models.append({"checkpoint": path, **policy.operator.names(), "table": table})
+        for name, content in run_sections(policy, labels, config, results):
+            models[-1][name] = content
+            results.update(**models[0])
+    if len(models) > 1:
+        results.update(models=models, comparison=comparison(paths, types, outcomes))
     results.update(status="finished")
 
 
@@ -103,29 +125,58 @@ def solve_tests(
     results: Results,
 ) -> list[Extremal]:
     """Labels of the test starts of every type, from the cache or solved."""
-    requests = [Request(theta, settings.starts, settings.seed, "test", float(settings.widen)) for theta in types]
-    solver = functools.partial(safe_labels_for, clearance=settings.clearance) if settings.safe else labels_for
-    labels, seconds = solver(game, requests, cache, workers=workers, report=label_progress())
+    labels, seconds = solve_starts(game, types, settings, cache, workers, float(settings.widen))
     results.time("test_labels", seconds)
     results.update(test_seed=settings.seed)
     return labels
 
 
+class Outcome(NamedTuple):
+    """What came of the episodes of a policy."""
+
+    table: list[TypeRow]
+    """Type by type."""
+    played: list[Trajectory]
+    """The episodes of every type."""
+    collided: list[Tensor]
+    """Whether it collides, start by start, one (safe starts,) per type."""
+
+
 def evaluate_policy(
     policy: OperatorPolicy, labels: Sequence[Extremal], settings: DictConfig, results: Results
-) -> list[TypeRow]:
-    """Roll out from the starts of the labels, put the table into the results and draw an episode."""
+) -> Outcome:
+    """Roll out from the starts of the labels, put the table into the results, keep some episodes and draw one."""
+    found = assess(policy, labels, settings, results)
+    write_json(results.path.parent / EPISODES, episodes(policy.game, found.played, labels, settings.clearance))
+    conditions = {name: settings[name] for name in ("clearance", "dt", "widen", "noise", "delay")}
+    results.update(**conditions, table=[row._asdict() for row in found.table], episodes=EPISODES)
+    draw(policy, labels[0], results.path.parent / "rollout.png", settings.dt)
+    return found
+
+
+def assess(policy: OperatorPolicy, labels: Sequence[Extremal], settings: DictConfig, results: Results) -> Outcome:
+    """Roll out from the starts of the labels."""
     began = time.perf_counter()
     disturbance = Disturbance(settings.noise, settings.delay, settings.seed)
     played = play(policy.game, policy, labels, settings.dt, disturbance)
-    table = table_of(played, labels, policy.operator.seen_types, settings.clearance)
+    operator = policy.operator
+    table = tabulate(policy.game, labels, played, operator.seen_types, settings.clearance, operator.field)
+    safe = [classify(found, settings.clearance)[0] for found in labels]
     results.time("evaluation", time.perf_counter() - began)
-    write_json(results.path.parent / EPISODES, episodes(policy.game, played, labels, settings.clearance))
-    results.update(episodes=EPISODES)
-    conditions = {name: settings[name] for name in ("clearance", "dt", "widen", "noise", "delay")}
-    results.update(**conditions, table=[row._asdict() for row in table])
-    draw(policy, labels[0], results.path.parent / "rollout.png", settings.dt)
-    return table
+    return Outcome(table, played, [collided(part)[mask] for part, mask in zip(played, safe, strict=True)])
+
+
+def comparison(
+    paths: Sequence[str], types: Sequence[tuple[float, ...]], outcomes: Sequence[Sequence[Tensor]]
+) -> dict[str, Any]:
+    """Every model against the first, over all types and type by type."""
+    rows = []
+    for path, other in zip(paths[1:], outcomes[1:], strict=True):
+        pairs = zip(types, outcomes[0], other, strict=True)
+        by_type = [{"theta": theta, **compare(first, second)._asdict()} for theta, first, second in pairs]
+        whole = compare(torch.cat(list(outcomes[0])), torch.cat(list(other)))
+        rows.append({"checkpoint": path, **whole._asdict(), "types": by_type})
+    return {"reference": paths[0], "models": rows}
 
 
 def draw(policy: OperatorPolicy, found: Extremal, path: Path, dt: float, episodes: int = 15) -> None:

@@ -8,6 +8,7 @@ import socket
 import sys
 import time
 import warnings
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlparse
@@ -15,15 +16,13 @@ from urllib.parse import urlparse
 import lightning as L
 import wandb
 from lightning.pytorch.callbacks import ProgressBar, RichProgressBar
-from lightning.pytorch.loggers import CSVLogger, Logger, WandbLogger
+from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger, WandbLogger
 from omegaconf import DictConfig, OmegaConf
 
 from hno.data.labels import Progress, Report
 from hno.registry import UnknownNameError, unknown_name
 
 log = logging.getLogger(__name__)
-
-LOGGERS = ("csv", "wandb")
 
 
 def send_lightning_to_hydra() -> None:
@@ -40,32 +39,71 @@ def send_lightning_to_hydra() -> None:
         logger.propagate = True
 
 
+class LoggerMissingError(RuntimeError):
+    """The optional package of a logger is not installed."""
+
+
 def loggers(config: DictConfig, folder: Path) -> list[Logger]:
-    """The chosen loggers.
+    """The chosen loggers, each once.
 
     Raises:
         UnknownNameError: unknown logger.
+        LoggerMissingError: the package of a logger is not installed.
+        ValueError: the names are not a list, or W&B cannot run as asked for.
     """
-    made: list[Logger] = []
-    for name in config.logger.names:
+    names = config.logger.names
+    if not OmegaConf.is_list(names):
+        raise ValueError(f"logger.names must be a list, such as [csv,wandb]; got {names!r}.")
+    for name in names:
         if name not in LOGGERS:
-            raise UnknownNameError(unknown_name("logger", name, list(LOGGERS)))
-        if name == "csv":
-            made.append(CSVLogger(folder, name="", version="csv"))
-        elif config.logger.mode != "disabled":
-            made.append(_wandb_logger(config, folder))
-    return made
+            raise UnknownNameError(unknown_name("logger", str(name), sorted(LOGGERS)))
+    made = [LOGGERS[name](config, folder) for name in dict.fromkeys(names)]
+    return [logger for logger in made if logger is not None]
 
 
-def _wandb_logger(config: DictConfig, folder: Path) -> WandbLogger:
+def _csv(config: DictConfig, folder: Path) -> Logger:
+    return CSVLogger(folder, name="", version="csv")
+
+
+def _tensorboard(config: DictConfig, folder: Path) -> Logger:
+    try:
+        return TensorBoardLogger(folder, name="", version="tensorboard", default_hp_metric=False)
+    except ModuleNotFoundError as error:
+        message = "TensorBoard is not installed: pip install 'hno[tensorboard]', or choose logger=csv."
+        raise LoggerMissingError(message) from error
+
+
+def _wandb(config: DictConfig, folder: Path) -> Logger | None:
+    mode = wandb_mode(config.logger.mode)
+    if mode == "disabled":
+        return None
     return WandbLogger(
         project=config.logger.project,
         group=folder.parent.name,
         name=folder.name,
         save_dir=folder,
-        mode=wandb_mode(config.logger.mode),
+        mode=mode,
         config=OmegaConf.to_container(config, resolve=True),
     )
+
+
+LOGGERS: Mapping[str, Callable[[DictConfig, Path], Logger | None]] = {
+    "csv": _csv,
+    "tensorboard": _tensorboard,
+    "wandb": _wandb,
+}
+"""What `logger.names` may hold."""
+
+
+def finish_wandb(results: Mapping[str, Any]) -> None:
+    """Close the W&B run of this process, if there is one, however the run ended: the next job gets its own.
+
+    Args:
+        results: content of results.json.
+    """
+    if wandb.run is not None:
+        wandb.run.summary.update({name: results[name] for name in ("status", "reason")})
+    wandb.finish(exit_code=int(results["status"] != "finished"))
 
 
 def wandb_mode(choice: str) -> str:

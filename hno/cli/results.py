@@ -81,8 +81,8 @@ class Results:
         self.write()
 
     def time(self, part: str, seconds: float) -> None:
-        """Record how long a part took and write the file."""
-        self.content["seconds"][part] = round(seconds, 3)
+        """Add to how long a part took and write the file."""
+        self.content["seconds"][part] = round(self.content["seconds"].get(part, 0.0) + seconds, 3)
         self.write()
 
     def write(self) -> None:

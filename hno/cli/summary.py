@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shlex
 import sys
 import traceback
 from collections.abc import Mapping, Sequence
@@ -14,70 +15,98 @@ from rich.console import Console
 from rich.table import Table
 
 import hno
+from hno.cli.sections import SECTIONS
+from hno.cli.tables import interval, number, percent, short_names, show_comparison, types
 from hno.registry import UnknownNameError
+from hno.report.totals import totals
 
 log = logging.getLogger(__name__)
 
-COLUMNS = ("theta", "labels", "safe", "collisions", "rate", "95 % interval", "distance", "excess cost", "apart")
-WIDTH = 120
+COLUMNS = (
+    "theta", "labels", "safe", "collisions", "rate", "95 % interval", "distance", "excess cost", "saturated", "errors",
+    "apart",
+)  # fmt: skip
+WIDTH = 140
 """Columns of text where there is no terminal to ask."""
 
 
 def show(results: Mapping[str, Any], folder: Path) -> None:
-    """Print the collision table, the totals and where everything lies."""
-    title = " / ".join(str(results[name]) for name in ("game", "operator", "activation"))
-    table = Table(*COLUMNS, title=title, caption=_caption(results))
-    for row in results["table"]:
-        table.add_row(*_cells(row))
+    """Print the tables and the sections of every model, the totals, where everything lies and how to see it."""
     console = Console(width=None if sys.stdout.isatty() else WIDTH)
-    console.print(table)
-    console.print(verdict(results["table"]))
+    models = results.get("models", [results])
+    names = short_names([str(model["checkpoint"]) for model in models]) if len(models) > 1 else [""]
+    for name, model in zip(names, models, strict=True):
+        _show_model(model, results["clearance"], name, console)
+    if "comparison" in results:
+        show_comparison(results["comparison"], console)
     spent = ", ".join(f"{part.replace('_', ' ')} {seconds:.0f} s" for part, seconds in results["seconds"].items())
-    console.print(f"Time: {spent}\nResults: {folder / 'results.json'}", soft_wrap=True)
+    console.print(f"Time: {spent}\nResults: {folder / 'results.json'}\n{where(folder)}", soft_wrap=True)
 
 
-def _caption(results: Mapping[str, Any]) -> str:
+def where(folder: Path) -> str:
+    """How to see a run or a sweep."""
+    return f"Page: python -m hno.report {shlex.quote(str(folder))}"
+
+
+def _show_model(model: Mapping[str, Any], clearance: float, name: str, console: Console) -> None:
+    parts = [str(model[key]) for key in ("game", "operator", "activation")]
+    table = Table(*COLUMNS, title=" / ".join([*parts, name] if name else parts), caption=_caption(clearance))
+    for row in model["table"]:
+        table.add_row(*_cells(row))
+    console.print(table)
+    console.print(verdict(model["table"]), *remarks(model["table"], clearance), sep="\n")
+    for key, section in SECTIONS.items():
+        if key in model:
+            section.show(model[key], console)
+
+
+def _caption(clearance: float) -> str:
     return (
-        f"safe: starts whose equilibrium keeps {100 * results['clearance']:g} cm; distance: smallest, in m; "
-        "excess cost: above the equilibrium's joint cost; both medians; apart: unsolved / inevitable / marginal starts"
+        f"safe: starts whose equilibrium keeps {100 * clearance:g} cm; distance: smallest, 5 % quantile and median, in "
+        "m; excess cost: above the equilibrium's joint cost, median; saturated: controls on a bound; errors: of values "
+        "and costates along labels; apart: unsolved / inevitable / marginal starts"
     )
 
 
 def _cells(row: Mapping[str, Any]) -> list[str]:
-    interval = row["interval"]
+    quantiles = row["distance_quantiles"]
     return [
-        ", ".join(f"{t:g}" for t in row["theta"]),
+        types(row["theta"]),
         "seen" if row["seen"] else "unseen",
         f"{row['safe_starts']} of {row['starts']}",
         str(row["collisions"]),
         percent(row["rate"]),
-        "n/a" if interval is None else f"{100 * interval[0]:.2f} to {100 * interval[1]:.2f} %",
-        number(row["median_min_distance"]),
+        interval(row["interval"]),
+        "n/a" if quantiles is None else f"{quantiles[0]:.2f}, {quantiles[-1]:.2f}",
         f"{number(row['median_excess_cost'])} of {number(row['median_label_cost'])}",
+        percent(row["saturated"], 1),
+        ", ".join(percent(row[name], 1) for name in ("value_error", "costate_error")),
         f"{row['unsolved']} / {row['inevitable']} / {row['marginal']}",
     ]
 
 
-def percent(rate: float | None) -> str:
-    """A rate for people; "n/a" when there was nothing to count."""
-    return "n/a" if rate is None else f"{100 * rate:.2f} %"
-
-
-def number(value: float | None) -> str:
-    """A number for people; "n/a" when there is none."""
-    return "n/a" if value is None else f"{value:.2f}"
+def remarks(table: Sequence[Mapping[str, Any]], clearance: float) -> list[str]:
+    """Which types have no rate and why, and which lie outside the game's range."""
+    said = [
+        f"No rate (n/a) at ({types(row['theta'])}): of {row['starts']} starts none has an equilibrium that keeps "
+        f"{100 * clearance:g} cm; {row['unsolved']} unsolved, {row['inevitable']} inevitable, {row['marginal']} "
+        "marginal."
+        for row in table
+        if row["rate"] is None
+    ]
+    outside = [f"({types(row['theta'])})" for row in table if row["extrapolated"]]
+    if outside:
+        said.append(f"Outside the types that the game is made for, results extrapolate: {', '.join(outside)}.")
+    return said
 
 
 def verdict(table: Sequence[Mapping[str, Any]]) -> str:
     """The totals over all types in one sentence."""
-    safe = sum(row["safe_starts"] for row in table)
-    if safe == 0:
+    whole = totals(table)
+    if whole.rate is None or whole.worst_theta is None:
         return "No start has a safe equilibrium: there is no collision rate (n/a)."
-    collisions = sum(row["collisions"] for row in table)
-    worst = max((row for row in table if row["rate"] is not None), key=lambda row: row["rate"])
-    at = ", ".join(f"{t:g}" for t in worst["theta"])
-    total = f"{collisions} collisions in {safe} safe starts ({percent(collisions / safe)})"
-    return f"{total}; worst {percent(worst['rate'])} at ({at})."
+    total = f"{whole.collisions} collisions in {whole.safe_starts} safe starts ({percent(whole.rate)})"
+    return f"{total}; worst {percent(whole.worst_rate)} at ({types(whole.worst_theta)})."
 
 
 def report(error: Exception) -> None:

@@ -11,21 +11,20 @@ from typing import Any
 
 import lightning as L
 import torch
-import wandb
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from hno.cli.build import build_data, build_game, build_operator, build_trainer, cache_folder, check_numbers
 from hno.cli.config import run_command
 from hno.cli.evaluate import check_evaluation, evaluate_policy, solve_tests
-from hno.cli.logs import label_progress, send_lightning_to_hydra
+from hno.cli.logs import finish_wandb, label_progress, send_lightning_to_hydra
+from hno.cli.media import publish
 from hno.cli.results import Results, config_hash, plain
 from hno.cli.summary import report, show
 from hno.data import GameData
 from hno.data.labels import Request, safe_labels_for
 from hno.data.trust import safe, summary
 from hno.evaluation.callbacks import DivergedError
-from hno.evaluation.closed_loop import TypeRow
 from hno.evaluation.validation import BEST, ClosedLoopValidation
 from hno.games import Game
 from hno.games.grid import parse_types
@@ -76,7 +75,7 @@ def train(config: DictConfig) -> bool:
         results.update(status="failed", reason="interrupted")
         raise
     finally:
-        wandb.finish(exit_code=int(results.content["status"] != "finished"))
+        finish_wandb(results.content)
     show(results.content, folder)
     return True
 
@@ -91,10 +90,9 @@ def _run(config: DictConfig, folder: Path, results: Results) -> None:
     policy = load_policy(folder / results.content["checkpoint"])
     types = list(dict.fromkeys([*policy.operator.seen_types, *unseen]))
     test = solve_tests(game, types, settings, cache_folder(config.data.cache), config.data.workers, results)
-    table = evaluate_policy(policy, test, settings, results)
-    for logger in trainer.loggers:
-        logger.log_metrics(totals(table), step=trainer.global_step)
+    evaluate_policy(policy, test, settings, results)
     results.update(status="finished")
+    publish(trainer.loggers, results.content, folder, trainer.global_step)
 
 
 def fit(config: DictConfig, folder: Path, results: Results) -> L.Trainer:
@@ -180,12 +178,3 @@ def check_validation(game: Game, choice: DictConfig) -> None:
         parse_types(game, choice.types)
     if choice.types is not None and not (isinstance(choice.starts, int) and choice.starts > 0):
         raise ValueError(f"validation.starts must be a positive whole number; got {choice.starts!r}.")
-
-
-def totals(table: Sequence[TypeRow]) -> dict[str, float]:
-    """Collision rate over all safe starts and at the worst type; empty without safe starts."""
-    counted = [row for row in table if row.rate is not None]
-    if not counted:
-        return {}
-    collisions, safe = sum(row.collisions for row in counted), sum(row.safe_starts for row in counted)
-    return {"test/collision_rate": collisions / safe, "test/worst_type": max(row.rate or 0.0 for row in counted)}

@@ -21,12 +21,12 @@ FRAMES = 50
 """An episode is kept at about so many times."""
 
 
-def episodes(game: Game, played: Trajectory, labels: Sequence[Extremal], clearance: float) -> dict[str, Any]:
+def episodes(game: Game, played: Sequence[Trajectory], labels: Sequence[Extremal], clearance: float) -> dict[str, Any]:
     """The worst and the typical episode of every type, among the starts that count.
 
     Args:
         game: the game.
-        played: episodes from the start states of all labels, in their order.
+        played: episodes from the start states of the labels, one set per type.
         labels: one set per type.
         clearance: what the label must keep for its start to count, m for distance constraints.
 
@@ -34,14 +34,12 @@ def episodes(game: Game, played: Trajectory, labels: Sequence[Extremal], clearan
         JSON content: positions of all players over time, the distance below which it is a collision, the path of the
         equilibrium from the same start, costs. Types without a start that counts are left out.
     """
-    first, kept = 0, []
-    for found in labels:
+    kept = []
+    for found, part in zip(labels, played, strict=True):
         safe = classify(found, clearance)[0].nonzero().squeeze(-1)
-        for kind, row in _chosen(played.clearance[first + safe], played.distance[first + safe]).items():
-            start = int(safe[row])
-            kept.append({"kind": kind, **_episode(game, played, first + start, found, start)})
-        first += len(found.status)
-    dimensions = game.positions(played.x[:1, 0]).shape[-1]
+        for kind, row in _chosen(part.clearance[safe], part.distance[safe]).items():
+            kept.append({"kind": kind, **_episode(game, part, found, int(safe[row]))})
+    dimensions = game.positions(played[0].x[:1, 0]).shape[-1]
     return {"players": game.players, "dimensions": dimensions, "episodes": kept}
 
 
@@ -53,9 +51,9 @@ def _chosen(clearance: Tensor, distance: Tensor) -> dict[str, int]:
     return {"worst": int(worst), "typical": int(distance.argsort()[len(distance) // 2])}
 
 
-def _episode(game: Game, played: Trajectory, row: int, label: Extremal, start: int) -> dict[str, Any]:
+def _episode(game: Game, played: Trajectory, label: Extremal, row: int) -> dict[str, Any]:
     stride = math.ceil(len(played.t) / FRAMES)
-    t, x, theta = played.t[::stride], played.x[row, ::stride], label.theta[start].to(played.x)
+    t, x, theta = played.t[::stride], played.x[row, ::stride], label.theta[row].to(played.x)
     places = game.positions(x)
     radius = game.constraint(x, theta.expand(len(t), -1)).amax(-1) + separation(places).amin(-1)
     return {
@@ -64,11 +62,11 @@ def _episode(game: Game, played: Trajectory, row: int, label: Extremal, start: i
         "clearance": _rounded(played.clearance[row]),
         "distance": _rounded(played.distance[row]),
         "cost": _rounded(-played.value[row].sum()),
-        "label_cost": _rounded(-label.value[start, 0].sum()),
+        "label_cost": _rounded(-label.value[row, 0].sum()),
         "t": _rounded(t),
         "positions": _rounded(places),
         "radius": _rounded(radius),
-        "label_positions": _rounded(_at(t, label.t, game.positions(label.x[start].to(x)))),
+        "label_positions": _rounded(_at(t, label.t, game.positions(label.x[row].to(x)))),
     }
 
 

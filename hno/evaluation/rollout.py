@@ -4,29 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from hno.evaluation.disturbance import Disturbance, believed, control_noise, normal, state_push
 from hno.games import Game
 from hno.games.kinematics import separation
 from hno.pontryagin.integrate import runge_kutta
 from hno.types import Trajectory
 
+__all__ = ["Disturbance", "Policy", "control_steps", "rollout"]
+
 Policy = Callable[[Tensor, Tensor, Tensor], Tensor]
 """(tau (B,), x (B, P, n), theta (B, P)) -> controls (B, P, m)."""
-
-
-class Disturbance(NamedTuple):
-    """What stands between a policy's answer and the control that is applied."""
-
-    noise: float = 0.0
-    """Standard deviation of Gaussian noise, new at every step, in half widths of the control box."""
-    delay: int = 0
-    """Steps by which controls come late; until the first one comes, it is applied in advance."""
-    seed: int = 0
-    """Of the noise."""
 
 
 @torch.no_grad()
@@ -50,22 +41,26 @@ def rollout(
         dt: time for which a control is held, s.
         substeps: Runge-Kutta steps within `dt`.
         points: states, interpolated within each of these, at which constraint and penalty are evaluated.
-        disturbance: of the controls.
+        disturbance: of controls, motion and beliefs.
 
     Raises:
-        ValueError: the horizon is not a whole multiple of `dt`.
+        ValueError: the horizon is not a whole multiple of `dt`, or states are pushed that the game does not have.
     """
     steps = control_steps(game, dt)
+    noise = control_noise(game, x0, theta, steps, disturbance)
+    push = state_push(game, x0, theta, steps, disturbance)
+    play = _believing(game, policy, x0, theta, disturbance)
     x, value = x0, torch.zeros_like(theta)
     clearance = distance = torch.full_like(theta[:, 0], torch.inf)
     path, controls, answers = [x], list[Tensor](), list[Tensor]()
-    generator = torch.Generator().manual_seed(disturbance.seed)
     for k in range(steps):
         tau = torch.full_like(theta[:, 0], game.horizon - k * dt)
-        answers.append(policy(tau, x, theta))
-        u = _disturbed(game, answers[max(0, k - disturbance.delay)], disturbance.noise, generator)
+        answers.append(play(tau, x, theta))
+        u = answers[max(0, k - disturbance.delay)]
+        if noise is not None:
+            u = game.control_box.clamp(u + noise[:, k])
         for _ in range(substeps):
-            after = runge_kutta(game, x, u, dt / substeps)
+            after = runge_kutta(game, x, u, dt / substeps, push=None if push is None else push[:, k])
             inner = _between(x, after, points)
             constraint = game.constraint(inner, theta.unsqueeze(1).expand(-1, points + 1, -1))
             clearance = torch.minimum(clearance, -constraint.amax((-2, -1)))
@@ -92,13 +87,19 @@ def control_steps(game: Game, dt: float) -> int:
     return round(steps)
 
 
-def _disturbed(game: Game, u: Tensor, noise: float, generator: torch.Generator) -> Tensor:
-    """Admissible controls with noise added, (B, P, m)."""
-    if noise == 0:
-        return u
-    box = game.control_box
-    draw = torch.randn(u.shape, generator=generator, dtype=u.dtype).to(u.device)
-    return box.clamp(u + noise * box.width / 2 * draw)
+def _believing(game: Game, policy: Policy, x0: Tensor, theta: Tensor, disturbance: Disturbance) -> Policy:
+    """The policy of players who act on their own estimates of types."""
+    if disturbance.belief == 0:
+        return policy
+    drawn = normal("belief", disturbance.seed, x0, theta, (game.players, game.players))
+    estimates = believed(game, theta, drawn, disturbance.belief).flatten(0, 1)
+
+    def play(tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
+        copies = tau.repeat_interleave(game.players), x.repeat_interleave(game.players, 0)
+        answers = policy(*copies, estimates).unflatten(0, theta.shape)
+        return answers.diagonal(dim1=1, dim2=2).mT
+
+    return play
 
 
 def _between(start: Tensor, end: Tensor, points: int) -> Tensor:

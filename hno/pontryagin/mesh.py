@@ -8,10 +8,26 @@ from torch import Tensor
 from hno.games import Game
 
 
+def label_steps(game: Game) -> int:
+    """Number of label intervals: as near to the game's label step as whole intervals allow, and at least one."""
+    return max(1, round(game.horizon / game.label_step))
+
+
 def label_times(game: Game, *, dtype: torch.dtype, device: torch.device) -> Tensor:
     """The uniform label grid from 0 to the horizon, s, shape (L,)."""
-    steps = round(game.horizon / game.label_step)
-    return torch.linspace(0, game.horizon, steps + 1, dtype=dtype, device=device)
+    return torch.linspace(0, game.horizon, label_steps(game) + 1, dtype=dtype, device=device)
+
+
+def inner_times(labels: Tensor, points: int = 10) -> Tensor:
+    """Times inside each label interval at which `encounter_weight` looks, ends included, s, (L - 1, points + 1)."""
+    share = torch.linspace(0, 1, points + 1, dtype=labels.dtype, device=labels.device)
+    return torch.lerp(labels[:-1, None], labels[1:, None], share)
+
+
+def encounter_weight(penalty: Tensor) -> Tensor:
+    """How much the players' penalties (B, L - 1, Q, P) vary within each label interval, plus a floor, (B, L - 1)."""
+    weight = penalty.sum(-1).diff(dim=-1).abs().sum(-1).nan_to_num(0, 0).clamp_min(1e-12).sqrt()
+    return weight / weight.amax(-1, keepdim=True) + 0.05
 
 
 def graded_mesh(labels: Tensor, weight: Tensor, extra: int) -> Tensor:

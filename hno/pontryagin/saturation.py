@@ -55,8 +55,8 @@ def nodes_at_kinks(
         z, size, ended = found
         done = ended == Status.CONVERGED
         length = max(t.shape[1], at.t.shape[1])
-        at = at._replace(t=_lengthened(at.t, length), z=_lengthened(at.z, length))
-        at.t[rows[done]], at.z[rows[done]] = _lengthened(t, length)[done], _lengthened(z, length)[done]
+        at = at._replace(t=lengthened(at.t, length), z=lengthened(at.z, length))
+        at.t[rows[done]], at.z[rows[done]] = lengthened(t, length)[done], lengthened(z, length)[done]
         residual[rows[done]], status[rows[done]] = size[done], Status.CONVERGED
     return at, residual, status
 
@@ -69,7 +69,7 @@ def _around(t: Tensor, kinks: Tensor, parts: int) -> list[Tensor]:
     return [torch.lerp(low, high, k / parts).where(~filler, kinks) for k in range(1, parts)]
 
 
-def _lengthened(part: Tensor, length: int) -> Tensor:
+def lengthened(part: Tensor, length: int) -> Tensor:
     """The last node repeated until there are `length` nodes, a copy."""
     last = part[:, -1:].expand(-1, length - part.shape[1], *part.shape[2:])
     return torch.cat([part, last], 1)

@@ -13,7 +13,7 @@ from hno.games.base import own_costate
 from hno.pontryagin.certificates import global_gap, local_gap, reintegration_error
 from hno.pontryagin.collocation import Collocation, Iterate
 from hno.pontryagin.integrate import runge_kutta
-from hno.pontryagin.mesh import graded_mesh, label_places, label_times
+from hno.pontryagin.mesh import encounter_weight, graded_mesh, inner_times, label_places, label_times
 from hno.pontryagin.newton import Newton, Solved, newton, rescue
 from hno.pontryagin.saturation import nodes_at_kinks
 from hno.pontryagin.starts import Search, Starts, find_starts
@@ -130,16 +130,11 @@ def _held(game: Game, labels: Tensor, x: Tensor, u: Tensor, t: Tensor) -> tuple[
     return runge_kutta(game, x[rows, left], control, (t - labels[left])[..., None, None]), control
 
 
-def _encounter_weight(game: Game, labels: Tensor, x: Tensor, u: Tensor, theta: Tensor, points: int = 10) -> Tensor:
-    """How much the penalty varies within each label interval, plus a floor, (B, L - 1)."""
-    share = torch.linspace(0, 1, points + 1, dtype=x.dtype, device=x.device)
-    t = torch.lerp(labels[:-1, None], labels[1:, None], share)
-    rows, steps = len(x), len(labels) - 1
-    inner = runge_kutta(game, x[:, :-1, None], u[:, :, None], (t - labels[:-1, None])[..., None, None])
-    types = theta[:, None, None].expand(rows, steps, points + 1, -1)
-    penalty = game.penalty(game.constraint(inner, types)).sum(-1)
-    weight = penalty.diff(dim=-1).abs().sum(-1).nan_to_num(0, 0).clamp_min(1e-12).sqrt()
-    return weight / weight.amax(-1, keepdim=True) + 0.05
+def _encounter_weight(game: Game, labels: Tensor, x: Tensor, u: Tensor, theta: Tensor) -> Tensor:
+    """Where a trajectory of held controls needs nodes, (B, L - 1)."""
+    since = inner_times(labels) - labels[:-1, None]
+    inner = runge_kutta(game, x[:, :-1, None], u[:, :, None], since[..., None, None])
+    return encounter_weight(game.penalty(game.constraint(inner, theta[:, None, None].expand(inner.shape[:-1]))))
 
 
 class Along(NamedTuple):

@@ -11,7 +11,7 @@ from torch import Tensor
 from hno.games import Game
 from hno.pontryagin.descent import descend
 from hno.pontryagin.held_controls import HeldControls
-from hno.pontryagin.mesh import label_times
+from hno.pontryagin.mesh import label_steps, label_times
 
 
 class Search(NamedTuple):
@@ -79,7 +79,7 @@ def manoeuvres(game: Game, players: int, *, dtype: torch.dtype, device: torch.de
     One channel at a time, every player goes one way or the other; the first shape is no manoeuvre at all. With
     `players` = 1 the shapes fit any one player.
     """
-    steps = round(game.horizon / game.label_step)
+    steps = label_steps(game)
     wave = torch.sin(2 * torch.pi * (torch.arange(steps, dtype=dtype, device=device) + 0.5) / steps)
     controls = game.control_dim
     signs = torch.tensor(list(itertools.product((1.0, -1.0), repeat=players)), dtype=dtype, device=device)

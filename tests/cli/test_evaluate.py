@@ -2,15 +2,23 @@ from __future__ import annotations
 
 import itertools
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from omegaconf import OmegaConf
+from torch import Tensor
 
 import hno
 from hno.cli.config import config_dir
 from hno.cli.evaluate import types_to_evaluate
+from hno.evaluation import closed_loop
+from hno.evaluation.residuals import REGIONS
+from hno.evaluation.rollout import Policy
+from hno.games import Game, make
 from hno.games.base import ExtrapolationWarning
+from hno.operators import operators
+from hno.types import Trajectory
 from tests.cli.conftest import SMOKE, Command, refused
 
 FAST = ("workers=1", "starts=4", "dt=0.1")
@@ -23,6 +31,7 @@ def test_evaluation_of_a_trained_model_repeats_the_table_of_its_run(command: Com
     assert run.code == 0, run.text
     results = run.results
     assert results["table"] == trained.results["table"]
+    assert results["table"][0]["costate_error"] is not None
     assert {name: results[name] for name in ("game", "operator", "activation", "status")} == {
         "game": "narrow_road", "operator": "hno", "activation": "tanh", "status": "finished",
     }  # fmt: skip
@@ -90,6 +99,10 @@ def test_impossible_types(command: Command, random_checkpoint: Path, theta: str,
         ("expected_game=drone", "of game 'narrow_road', expected 'drone'"),
         ("start=5", "Did you mean 'starts'?"),
         ("checkpoint=/nowhere/last.ckpt", "There is no checkpoint at /nowhere/last.ckpt"),
+        ("checkpoint=[/nowhere/last.ckpt]", "There is no checkpoint at /nowhere/last.ckpt"),
+        ("checkpoint=[]", "There is no checkpoint at []"),
+        ("residuals=yes please", "residuals must be true or false"),
+        ("robustness=1", "robustness must be true or false"),
     ],
 )
 def test_impossible_settings(command: Command, random_checkpoint: Path, override: str, message: str) -> None:
@@ -122,3 +135,153 @@ def test_without_a_safe_start_the_rate_is_not_applicable(command: Command, rando
     assert run.code == 0, run.text
     assert run.results["table"][0]["rate"] is None
     assert "n/a" in run.text
+    assert "No rate (n/a) at (1, 1): of 4 starts none has an equilibrium that keeps 5000 cm" in run.text
+
+
+def test_without_a_safe_start_every_section_says_so(command: Command, random_checkpoint: Path) -> None:
+    both = f"checkpoint=[{random_checkpoint},{random_checkpoint}]"
+    run = command("evaluate", both, "theta=1,1", "clearance=50", "robustness=true", *FAST)
+    assert run.code == 0, run.text
+    row = run.results["robustness"][0]
+    (compared,) = run.results["comparison"]["models"]
+    assert (row["safe_starts"], row["rate"], row["interval"], row["median_excess_cost"]) == (0, None, None, None)
+    assert (compared["starts"], compared["difference"], compared["interval"], compared["p_value"]) == (0, *[None] * 3)
+    assert "0.00 %" not in run.text
+
+
+def other(checkpoint: Path, folder: Path, game: str = "narrow_road", seed: int = 1, **constants: float) -> Path:
+    """Another operator with random weights."""
+    torch.manual_seed(seed)
+    operator = operators.get("sno")(make(game, **constants), width=16, depth=2)
+    operator.seen_types = [(1.0, 1.0), (5.0, 5.0)]
+    content: dict[str, object] = {"state_dict": operator.state_dict()}
+    operator.on_save_checkpoint(content)
+    path = checkpoint.parent.parent / folder / "last.ckpt"
+    path.parent.mkdir()
+    torch.save(content, path)
+    return path
+
+
+def test_results_hold_the_configuration(command: Command, random_checkpoint: Path) -> None:
+    config = command("evaluate", f"checkpoint={random_checkpoint}", "theta=1,1", "noise=0.1", *FAST).results["config"]
+    assert (config["checkpoint"], config["theta"], config["noise"]) == (str(random_checkpoint), "1,1", 0.1)
+    assert (config["starts"], config["residuals"]) == (4, True)
+
+
+def test_residuals_are_a_section_that_can_be_switched_off(command: Command, random_checkpoint: Path) -> None:
+    run = command("evaluate", f"checkpoint={random_checkpoint}", "theta=1,1;2,2", *FAST)
+    rows = run.results["residuals"]
+    assert [(row["theta"], row["region"]) for row in rows] == [
+        (theta, region) for theta in ([1, 1], [2, 2]) for region in REGIONS
+    ]
+    assert all(row["physical"] > 0 and row["points"] > 0 for row in rows)
+    assert "HJI residual" in run.text
+    assert run.results["seconds"].keys() >= {"residuals", "evaluation"}
+    without = command("evaluate", f"checkpoint={random_checkpoint}", "theta=1,1", "residuals=false", *FAST)
+    assert "residuals" not in without.results
+    assert "HJI residual" not in without.text
+
+
+def test_robustness_is_a_section_on_request(command: Command, random_checkpoint: Path) -> None:
+    arguments = (f"checkpoint={random_checkpoint}", "theta=1,1;2,2", "residuals=false", *FAST)
+    asked = (*arguments, "robustness=true", "+conditions.heading={drift: 0.1, components: [2]}")
+    run = command("evaluate", *asked)
+    assert run.code == 0, run.text
+    rows = {row["name"]: row for row in run.results["robustness"]}
+    assert list(rows) == [*OmegaConf.load(config_dir() / "evaluate.yaml").conditions, "heading"]
+    assert rows["heading"]["disturbance"] == {"drift": 0.1, "components": [2]}
+    plain, table = rows["nominal"], run.results["table"]
+    for name in ("safe_starts", "collisions"):
+        assert plain[name] == sum(row[name] for row in table)
+        assert [entry[name] for entry in plain["types"]] == [row[name] for row in table]
+    assert rows["belief"]["disturbance"] == {"belief": 0.5}
+    assert rows["widened"]["median_label_cost"] != plain["median_label_cost"]
+    costs = [row["median_excess_cost"] for row in rows.values()]
+    assert len(set(costs)) == len(costs), "every condition changes something"
+    assert "Robustness" in run.text
+    again = command("evaluate", *asked)
+    assert again.results["robustness"] == run.results["robustness"]
+    assert "robustness" not in command("evaluate", *arguments).results
+
+
+@pytest.mark.usefixtures("no_labels")
+def test_impossible_conditions(command: Command, random_checkpoint: Path) -> None:
+    arguments = (f"checkpoint={random_checkpoint}", "robustness=true", *FAST)
+    refused(command("evaluate", *arguments, "+conditions.delay.noisy=1"), "No condition entry named 'noisy'", "'noise'")
+    refused(command("evaluate", *arguments, "+conditions.gusts.components=[7]"), "places in a player's state, 0 to 3")
+
+
+def test_models_are_compared_on_the_same_starts(command: Command, random_checkpoint: Path) -> None:
+    second = other(random_checkpoint, Path("second"))
+    arguments = ("theta=1,1;2,2", "residuals=false", *FAST)
+    run = command("evaluate", f"checkpoint=[{random_checkpoint},{second}]", *arguments)
+    assert run.code == 0, run.text
+    results, models = run.results, run.results["models"]
+    assert [model["checkpoint"] for model in models] == [str(random_checkpoint), str(second)]
+    assert [model["operator"] for model in models] == ["hno", "sno"]
+    for model in models:
+        alone = command("evaluate", f"checkpoint={model['checkpoint']}", *arguments).results
+        assert alone["table"] == model["table"]
+        assert "models" not in alone
+    for name in ("checkpoint", "game", "operator", "activation", "table"):
+        assert results[name] == models[0][name]
+    (compared,) = results["comparison"]["models"]
+    assert compared["checkpoint"] == str(second)
+    for first, third, pair in zip(models[0]["table"], models[1]["table"], compared["types"], strict=True):
+        assert pair["starts"] == first["safe_starts"] == third["safe_starts"]
+        assert pair["both"] + pair["only_reference"] == first["collisions"]
+        assert pair["both"] + pair["only_other"] == third["collisions"]
+    for name in ("starts", "both", "only_reference", "only_other"):
+        assert compared[name] == sum(pair[name] for pair in compared["types"])
+    assert "random/last.ckpt" in run.text
+    assert "against random/last.ckpt" in run.text
+
+
+def test_every_model_meets_the_same_safe_starts(
+    command: Command, random_checkpoint: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever it is, was trained with, and how it is disturbed: starts come from labels, and labels from the seed."""
+    met: list[Tensor] = []
+    original = closed_loop.rollout
+
+    def watched(game: Game, policy: Policy, x0: Tensor, theta: Tensor, *others: Any, **options: Any) -> Trajectory:
+        met.append(torch.cat([x0.flatten(1), theta], 1))
+        return original(game, policy, x0, theta, *others, **options)
+
+    monkeypatch.setattr(closed_loop, "rollout", watched)
+    second, arguments = other(random_checkpoint, Path("second")), ("theta=1,1", "residuals=false", *FAST)
+    tables = [
+        command("evaluate", f"checkpoint={path}", *arguments, *more).results["table"]
+        for path, more in ((random_checkpoint, ()), (second, ()), (second, ("noise=0.3", "delay=2")))
+    ]
+    assert len(met) == 3
+    assert all(torch.equal(starts, met[0]) for starts in met)
+    kinds = ("starts", "unsolved", "inevitable", "marginal", "safe_starts")
+    assert len({tuple(table[0][kind] for kind in kinds) for table in tables}) == 1
+    command("evaluate", f"checkpoint={second}", *arguments, "seed=7")
+    assert not torch.equal(met[-1], met[0])
+
+
+def test_default_types_are_those_of_all_models(command: Command, random_checkpoint: Path) -> None:
+    second = other(random_checkpoint, Path("second"))
+    run = command("evaluate", f"checkpoint=[{random_checkpoint},{second}]", "unseen=[]", "residuals=false", *FAST)
+    assert [[row["seen"] for row in model["table"]] for model in run.results["models"]] == [[True, False], [True, True]]
+    assert [row["theta"] for row in run.results["table"]] == [[1, 1], [5, 5]]
+
+
+@pytest.mark.usefixtures("no_labels")
+def test_models_of_different_games_are_refused(command: Command, random_checkpoint: Path) -> None:
+    drone = other(random_checkpoint, Path("drone"), "drone")
+    wide = other(random_checkpoint, Path("wide"), radius=1.5)
+    run = command("evaluate", f"checkpoint=[{random_checkpoint},{drone}]", *FAST)
+    refused(run, "Models of different games", "NarrowRoad()", f"{drone} plays Drone()", "Evaluate them one by one")
+    assert run.results["status"] == "failed"
+    refused(command("evaluate", f"checkpoint=[{random_checkpoint},{wide}]", *FAST), "NarrowRoad(radius=1.5)")
+
+
+def test_types_outside_the_range_are_in_the_summary(command: Command, random_checkpoint: Path) -> None:
+    run = command("evaluate", f"checkpoint={random_checkpoint}", "theta=1,1;0.5,1", "residuals=false", *FAST)
+    assert run.code == 0, run.text
+    assert "ExtrapolationWarning" in run.text
+    assert "results extrapolate: (0.5, 1)." in run.text
+    assert [row["extrapolated"] for row in run.results["table"]] == [False, True]

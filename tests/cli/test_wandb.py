@@ -12,7 +12,9 @@ import wandb
 
 from hno.cli import logs
 from hno.cli.logs import wandb_mode
+from hno.cli.media import numbers
 from tests.cli.conftest import SMOKE, Command, Outcome
+from tests.cli.wandb_file import offline_run
 
 ROOT = Path(__file__).parents[2]
 
@@ -38,10 +40,17 @@ def check_jobs(folder: Path, games: str, operators: str, activations: str) -> No
     got = [Outcome(0, "", job).results for job in folders]
     assert [(r["game"], r["operator"], r["activation"]) for r in got] == wanted
     assert [(r["status"], r["steps"]) for r in got] == [("finished", 5)] * len(wanted)
-    runs = [list(job.glob("wandb/offline-run-*/run-*.wandb")) for job in folders]
-    assert [len(run) for run in runs] == [1] * len(wanted)
-    assert len({run[0].name for run in runs}) == len(wanted)
-    assert all(run[0].stat().st_size > 1000 for run in runs)
+    runs = [offline_run(job) for job in folders]
+    assert len({run.id for run in runs}) == len(wanted)
+    assert [(run.name, run.group, run.exit_code) for run in runs] == [(job.name, "sweep", 0) for job in folders]
+    assert [(run.config["game"]["name"], run.config["operator"]["name"], run.config["activation"]["name"])
+            for run in runs] == wanted  # fmt: skip
+    for run, results in zip(runs, got, strict=True):
+        expected = {**numbers(results), "status": "finished", "reason": None}
+        assert expected.keys() >= {"test/excess_cost", "collision_rate/1,1", "seconds/training"}
+        assert {name: run.summary[name] for name in expected} == expected
+        assert run.summary.keys() >= {"rollout/filenames", "collision_map/filenames", "test/worst_theta"}
+        assert sum("loss/total" in row for row in run.history) == 1
     assert all((job / "csv" / "metrics.csv").is_file() for job in folders)
 
 
@@ -65,7 +74,10 @@ def test_a_failed_run_is_finished_too(command: Command) -> None:
     run = command("train", *SMOKE, "logger=wandb", "optimizer.lr=inf")
     assert run.code == 1
     assert wandb.run is None
-    assert len(list(run.folder.glob("wandb/offline-run-*/run-*.wandb"))) == 1
+    kept = offline_run(run.folder)
+    assert kept.exit_code == 1
+    assert kept.summary["status"] == "failed"
+    assert kept.summary["reason"] == run.results["reason"]
     assert run.text.count("W&B runs offline: no API key") == 1
     assert run.results["status"] == "failed"
 

@@ -6,10 +6,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from hno.cli.summary import percent, show, verdict
+from hno.cli.summary import remarks, show, verdict
+from hno.cli.tables import percent
 from hno.evaluation.closed_loop import TypeRow, classify, collision_table
-from hno.evaluation.rollout import Disturbance
-from hno.types import Extremal, Status
+from hno.evaluation.rollout import Disturbance, rollout
+from hno.types import Extremal, Field, Points, Status
 from tests.fakes import fake_labels
 from tests.walkers import Walkers
 
@@ -111,6 +112,64 @@ def test_a_disturbance_reaches_the_episodes() -> None:
     assert len({*noisy, distance(Disturbance())}) == 3
 
 
+def test_quantiles_saturation_and_own_costs_are_of_safe_starts() -> None:
+    heights = [0.5 + 0.01 * k for k in range(21)] + [0.05]
+    found = labelled(heights, [0.5] * 21 + [-1.0])
+
+    def fast(tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
+        """Both at full speed along x, the first one also across in the last tenth; who is not safe stands still."""
+        u = torch.tensor([6.0, 0.0]).repeat(len(x), 2, 1)
+        u[tau < 0.11, 0, 1] = 6.0
+        return u * (x[:, 1:, 1:] > 0.1)
+
+    (row,) = collision_table(Walkers(), fast, [found], seen=[], dt=0.1)
+    assert row.distance_quantiles == pytest.approx((1.02, 1.1, 1.2), abs=2e-3)
+    assert row.distance_quantiles is not None
+    assert row.distance_quantiles[-1] == row.median_min_distance
+    assert row.saturated == pytest.approx((10 + 1 + 10) / 40)
+    played = rollout(Walkers(), fast, found.x[:21, 0].float(), found.theta[:21].float(), 0.1)
+    excess = -played.value.double() + found.value[:21, 0]
+    assert row.median_excess_costs == pytest.approx(excess.median(0).values.tolist())
+    assert row.median_excess_cost == pytest.approx(excess.sum(-1).median().item())
+
+
+def test_errors_are_weighted_over_the_nodes_of_converged_labels() -> None:
+    """As torchmetrics' WeightedMeanAbsolutePercentageError: sum of errors over sum of labels."""
+    found = labelled([0.9, 0.8, 0.7], [0.5, -0.2, 0.5], [GOOD, GOOD, BAD])
+    asked: list[Points] = []
+
+    def field(points: Points) -> Field:
+        asked.append(points)
+        value, costate = (column[:2].flatten(0, 1).float() for column in (found.value, found.costate))
+        return Field(0.9 * value, points.theta, costate + 0.1)
+
+    (row,) = collision_table(Walkers(), straight, [found], seen=[], field=field)
+    assert torch.equal(asked[0].x, found.x[:2].flatten(0, 1).float())
+    torch.testing.assert_close(asked[0].tau, (1 - found.t).repeat(2).float())
+    assert row.value_error == pytest.approx(0.1, rel=1e-5)
+    assert row.costate_error == pytest.approx(0.1 / found.costate[:2].abs().mean().item(), rel=1e-5)
+
+
+def test_without_a_value_function_or_a_label_there_are_no_errors() -> None:
+    (row,) = collision_table(Walkers(), straight, [labelled([0.9], [0.5])], seen=[])
+    assert (row.value_error, row.costate_error) == (None, None)
+
+    def never(points: Points) -> Field:
+        raise AssertionError("there is nothing to compare with")
+
+    (row,) = collision_table(Walkers(), straight, [labelled([0.9], [0.5], [BAD])], seen=[], field=never)
+    assert (row.value_error, row.costate_error, row.saturated, row.distance_quantiles) == (None,) * 4
+
+
+def test_types_outside_the_range_of_the_game_are_marked() -> None:
+    sets = [labelled([0.9], [0.5], theta=theta) for theta in (0.0, 4.0, 4.5)]
+    rows = collision_table(Walkers(), straight, sets, seen=[])
+    assert [row.extrapolated for row in rows] == [False, False, True]
+    assert remarks([row._asdict() for row in rows], 0.02) == [
+        "Outside the types that the game is made for, results extrapolate: (4.5, 4.5)."
+    ]
+
+
 @pytest.fixture
 def nothing_safe() -> TypeRow:
     found = labelled([0.9, 0.9, 0.9], [-0.5, 0.01, 0.5], [GOOD, GOOD, BAD])
@@ -119,7 +178,10 @@ def nothing_safe() -> TypeRow:
 
 def test_without_a_safe_start_there_is_no_rate(nothing_safe: TypeRow) -> None:
     assert nothing_safe.safe_starts == 0
-    numbers = ("rate", "interval", "median_min_distance", "median_excess_cost", "median_label_cost")
+    numbers = (
+        "rate", "interval", "median_min_distance", "median_excess_cost", "median_label_cost", "distance_quantiles",
+        "median_excess_costs", "saturated",
+    )  # fmt: skip
     assert all(getattr(nothing_safe, name) is None for name in numbers)
 
 
@@ -133,6 +195,8 @@ def test_summary_says_not_applicable_and_not_zero(
     assert "n/a" in printed
     assert "0.00 %" not in printed
     assert "there is no collision rate (n/a)" in printed
+    assert "No rate (n/a) at (1, 1): of 3 starts none has an equilibrium that keeps 2 cm" in printed
+    assert "1 unsolved, 1 inevitable, 1 marginal." in " ".join(printed.split())
     assert percent(None) == "n/a"
 
 

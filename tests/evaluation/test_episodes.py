@@ -37,7 +37,7 @@ def sets() -> list[Extremal]:
 def test_the_worst_and_the_typical_start_that_count_are_kept(sets: list[Extremal]) -> None:
     """Distances are 1.8, 0.8, 0.1, 1.0 and 1.6, 0.7, 1.4; the radius of a type is 0.2 + 0.2 theta."""
     game = Walkers()
-    kept = episodes(game, play(game, straight, sets), sets, 0.02)
+    kept = episodes(game, play(game, straight, sets, 0.02), sets, 0.02)
     assert (kept["players"], kept["dimensions"]) == (2, 2)
     found = [(e["theta"][0], e["kind"], e["distance"], e["collided"]) for e in kept["episodes"]]
     assert found == [
@@ -51,15 +51,17 @@ def test_the_worst_and_the_typical_start_that_count_are_kept(sets: list[Extremal
 
 def test_an_episode_shows_where_players_go_and_where_the_equilibrium_goes(sets: list[Extremal]) -> None:
     game = Walkers()
-    played = play(game, straight, sets)
+    played = play(game, straight, sets, 0.02)
     episode = episodes(game, played, sets, 0.02)["episodes"][0]
     frames = len(episode["t"])
     assert FRAMES / 2 < frames <= FRAMES + 1
     assert (episode["t"][0], episode["t"][-1]) == (0.0, pytest.approx(game.horizon))
     for name in ("positions", "label_positions"):
         assert torch.tensor(episode[name]).shape == (frames, 2, 2)
-    torch.testing.assert_close(torch.tensor(episode["positions"][0]), game.positions(played.x[3, 0]), atol=1e-3, rtol=0)
-    assert episode["cost"] == pytest.approx(-float(played.value[3].sum()), abs=1e-3)
+    torch.testing.assert_close(
+        torch.tensor(episode["positions"][0]), game.positions(played[0].x[3, 0]), atol=1e-3, rtol=0
+    )
+    assert episode["cost"] == pytest.approx(-float(played[0].value[3].sum()), abs=1e-3)
     assert episode["label_cost"] == pytest.approx(-float(sets[0].value[3, 0].sum()), abs=1e-3)
     middle = sets[0].x[3].float()
     ends = game.positions(middle)[[0, -1]]
@@ -68,8 +70,8 @@ def test_an_episode_shows_where_players_go_and_where_the_equilibrium_goes(sets: 
 
 def test_a_broken_episode_is_the_worst(sets: list[Extremal]) -> None:
     """What is not finite counts as a collision, and stays readable JSON once the writer has replaced it."""
-    played = play(Walkers(), straight, sets)
-    played.clearance[1] = torch.nan
+    played = play(Walkers(), straight, sets, 0.02)
+    played[0].clearance[1] = torch.nan
     worst = episodes(Walkers(), played, sets, 0.02)["episodes"][0]
     assert (worst["kind"], worst["collided"]) == ("worst", True)
     assert worst["distance"] == pytest.approx(1.8, abs=2e-3)
@@ -83,6 +85,6 @@ def test_three_dimensions_and_the_size_of_the_file() -> None:
     def hover(tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
         return torch.tensor([0.0, 0.0, 9.81]).expand(len(x), 2, 3)
 
-    kept = episodes(game, play(game, hover, found), found, 0.02)
+    kept = episodes(game, play(game, hover, found, 0.02), found, 0.02)
     assert kept["dimensions"] == 3
     assert len(json.dumps(kept)) / len(kept["episodes"]) < 8000

@@ -257,7 +257,7 @@ def test_delay_and_noise_together_disturb_the_older_answer() -> None:
     def counting(tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
         return torch.full((len(x), 2, 2), 0.1 * next(steps), dtype=torch.float64)
 
-    x0, theta = torch.zeros(50, 2, 2, dtype=torch.float64), torch.ones(50, 2, dtype=torch.float64)
+    x0, theta = torch.linspace(0, 1, 200).double().view(50, 2, 2), torch.ones(50, 2, dtype=torch.float64)
     played = rollout(game, counting, x0, theta, 0.05, disturbance=Disturbance(1e-3, 2))
     wanted = 0.1 * torch.tensor([max(0, k - 2) for k in range(20)], dtype=torch.float64)
     error = played.u - wanted[:, None, None]

@@ -1,0 +1,116 @@
+"""What dashboards get at the end of a run: numbers by type, a map over types, episodes as picture and animation."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from lightning.pytorch.loggers import Logger, TensorBoardLogger, WandbLogger
+
+from hno.cli.tables import number
+from hno.report.collision_map import collision_map
+from hno.report.gif import animate
+from hno.report.picture import PlotsMissingError
+from hno.report.totals import totals
+
+log = logging.getLogger(__name__)
+
+
+def publish(loggers: Sequence[Logger], results: Mapping[str, Any], folder: Path, step: int) -> None:
+    """Send what came of a run to its loggers. One that refuses costs a warning, not the run.
+
+    Args:
+        loggers: all of them get the numbers; W&B pictures, an animation and the table too; TensorBoard pictures.
+        results: content of results.json.
+        folder: the run's; pictures are written there.
+        step: the last one of the training.
+    """
+    pictures = draw(results, folder, {type(logger) for logger in loggers})
+    for logger in loggers:
+        try:
+            if isinstance(logger, WandbLogger):
+                _send_to_wandb(logger, results, pictures, step)
+            elif isinstance(logger, TensorBoardLogger):
+                _send_to_tensorboard(logger, results, pictures, step)
+            else:
+                logger.log_metrics(numbers(results), step)
+            logger.finalize("success")  # the end of the training finalized it before these numbers came
+        except Exception as error:
+            log.warning("%s did not take the results: %s", type(logger).__name__, error)
+
+
+def numbers(results: Mapping[str, Any]) -> dict[str, float]:
+    """Results under the names by which dashboards show them; what does not exist is left out."""
+    whole, validation = totals(results["table"]), results.get("validation") or {}
+    found = {
+        "test/collision_rate": whole.rate,
+        "test/worst_type": whole.worst_rate,
+        "test/excess_cost": whole.excess,
+        "test/safe_starts": whole.safe_starts,
+        "best/collision_rate": validation.get("collision_rate"),
+        "best/excess_cost": validation.get("excess"),
+        **{f"collision_rate/{name_of(row['theta'])}": row["rate"] for row in results["table"]},
+        **{f"seconds/{part}": seconds for part, seconds in results["seconds"].items()},
+    }
+    return {name: float(value) for name, value in found.items() if value is not None}
+
+
+def name_of(theta: Sequence[float]) -> str:
+    """Player types in one word."""
+    return ",".join(f"{t:g}" for t in theta)
+
+
+def draw(results: Mapping[str, Any], folder: Path, kinds: Collection[type[Logger]]) -> dict[str, Path]:
+    """Draw into the folder what loggers of these kinds take; say what cannot be drawn.
+
+    Returns:
+        Names and files of the pictures.
+    """
+    title = " / ".join(str(results.get(name, "n/a")) for name in ("game", "operator", "activation"))
+    made = {"rollout": folder / "rollout.png"}
+    try:
+        worst = worst_episode(results, folder) if WandbLogger in kinds else None
+        if worst is not None:
+            made["worst_episode"] = folder / "worst_episode.gif"
+            heading = f"{title}\nsmallest clearance, {number(worst['clearance'])} m at ({name_of(worst['theta'])})"
+            animate(worst, made["worst_episode"], heading)
+        if not {WandbLogger, TensorBoardLogger}.isdisjoint(kinds):
+            made["collision_map"] = folder / "collision_map.png"
+            collision_map(results["table"], made["collision_map"], title)
+    except (PlotsMissingError, OSError, ValueError) as error:
+        log.info("No picture for dashboards: %s", error)
+    return {name: path for name, path in made.items() if path.exists()}
+
+
+def worst_episode(results: Mapping[str, Any], folder: Path) -> dict[str, Any] | None:
+    """The stored episode of the smallest clearance; None if the run stored none."""
+    if not results.get("episodes"):
+        return None
+    episodes = json.loads((folder / results["episodes"]).read_text())["episodes"]
+    return min(episodes, key=lambda episode: episode["clearance"], default=None)
+
+
+def _send_to_wandb(logger: WandbLogger, results: Mapping[str, Any], pictures: Mapping[str, Path], step: int) -> None:
+    logger.log_metrics(numbers(results), step)
+    worst = totals(results["table"]).worst_theta
+    logger.experiment.summary["test/worst_theta"] = "n/a" if worst is None else name_of(worst)
+    for name, path in pictures.items():
+        send = logger.log_video if path.suffix == ".gif" else logger.log_image
+        send(name, [str(path)], step)
+    columns = list(results["table"][0]) if results["table"] else []
+    logger.log_table("types", columns, [[str(row[name]) for name in columns] for row in results["table"]], step=step)
+
+
+def _send_to_tensorboard(
+    logger: TensorBoardLogger, results: Mapping[str, Any], pictures: Mapping[str, Path], step: int
+) -> None:
+    head = {name: str(results.get(name)) for name in ("game", "operator", "activation", "seed", "config_hash")}
+    logger.log_hyperparams(head, numbers(results), step)
+    for name, path in pictures.items():
+        if path.suffix == ".png":
+            from matplotlib.image import imread
+
+            logger.experiment.add_image(name, imread(path), step, dataformats="HWC")

@@ -1,0 +1,112 @@
+"""Two policies on the same starts: how much more often one of them collides."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from scipy.optimize import brentq
+from scipy.stats import binomtest, norm
+from torch import Tensor
+
+from hno.games import Game
+
+
+class Comparison(NamedTuple):
+    """A policy against a reference, start by start; numbers that do not exist are None."""
+
+    starts: int
+    """Pairs of episodes: safe starts of all types."""
+    both: int
+    """Starts from which both collide."""
+    only_reference: int
+    """Starts from which only the reference collides."""
+    only_other: int
+    """Starts from which only the other one collides."""
+    difference: float | None
+    """Collision rate of the other one minus that of the reference."""
+    interval: tuple[float, float] | None
+    """Tango's 95 % score interval of the difference."""
+    p_value: float | None
+    """Exact McNemar test of equal rates, two-sided."""
+
+
+class DifferentGamesError(ValueError):
+    """Models whose starts cannot be paired."""
+
+
+def check_same_game(names: Sequence[str], games: Sequence[Game]) -> None:
+    """Refuse to compare models of different games.
+
+    Args:
+        names: of the models, for the message.
+        games: of the models.
+
+    Raises:
+        DifferentGamesError: the games differ, by class or by constants.
+    """
+    for name, game in zip(names, games, strict=True):
+        if game.fingerprint() != games[0].fingerprint():
+            first, second = (f"{type(g).__name__}({_constants(g)})" for g in (games[0], game))
+            raise DifferentGamesError(
+                f"Models of different games have no starts in common: {names[0]} plays {first}, {name} plays {second}. "
+                "Evaluate them one by one."
+            )
+
+
+def _constants(game: Game) -> str:
+    return ", ".join(f"{name}={value}" for name, value in game.constants.items())
+
+
+def compare(reference: Tensor, other: Tensor) -> Comparison:
+    """Compare two policies by their collisions.
+
+    Args:
+        reference: whether the reference collides from each start, (B,).
+        other: whether the other one does from the same starts, (B,).
+    """
+    n, both = len(reference), int((reference & other).sum())
+    only_reference, only_other = int((reference & ~other).sum()), int((other & ~reference).sum())
+    counts = n, both, only_reference, only_other
+    if n == 0:
+        return Comparison(*counts, None, None, None)
+    interval = tango(only_reference, only_other, n)
+    return Comparison(*counts, (only_other - only_reference) / n, interval, mcnemar(only_reference, only_other))
+
+
+def mcnemar(first: int, second: int) -> float:
+    """p-value of equal rates, from the numbers of discordant pairs; 1 without any.
+
+    Given how many pairs are discordant, either kind is equally likely (McNemar 1947, in its exact, two-sided form).
+    """
+    return float(binomtest(first, first + second).pvalue) if first + second else 1.0
+
+
+def tango(first: int, second: int, pairs: int, confidence: float = 0.95) -> tuple[float, float]:
+    """Score interval of the difference of two paired proportions, second minus first (Tango, Stat. Med. 17, 1998).
+
+    It holds the differences that a score test does not reject, so that it holds 0 exactly where McNemar's asymptotic
+    test does not reject equal rates, and it has a width without discordant pairs too.
+
+    Args:
+        first: pairs in which only the first event happens.
+        second: pairs in which only the second one does.
+        pairs: all pairs, at least 1.
+        confidence: level.
+    """
+    z = float(norm.ppf((1 + confidence) / 2))
+    return -_upper(second, first, pairs, z), _upper(first, second, pairs, z)
+
+
+def _upper(b: int, c: int, n: int, z: float) -> float:
+    """The difference above (c - b) / n whose score is -z."""
+    estimate = (c - b) / n
+
+    def excess(delta: float) -> float:
+        """Squared score minus z^2, times the variance, which vanishes at the ends."""
+        half = (b + c + (c - b) * delta - 2 * n * delta) / 2
+        only_first = (half + math.sqrt(max(0.0, half**2 + 2 * n * b * delta * (1 - delta)))) / (2 * n)
+        return (c - b - n * delta) ** 2 - z**2 * n * (2 * only_first + delta * (1 - delta))
+
+    return float(brentq(excess, estimate + 1e-12, 1.0, xtol=1e-12))

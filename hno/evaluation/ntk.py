@@ -1,0 +1,166 @@
+"""The neural tangent kernel of a trained operator, J J' over all its parameters (Jacot et al. 2018), and its spectrum.
+
+The rows of J are the gradients of what training makes small: the HJI residual and the deviations of value and costate
+from labels, each in the size that the loss measures it in (a stack of residuals as in Wang et al. 2022).
+"""
+
+from __future__ import annotations
+
+import copy
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.func import functional_call, jacrev, vmap
+
+from hno.data.rows import rows_of
+from hno.evaluation.spectrum import Spectrum, spectrum
+from hno.losses import Scales
+from hno.losses.hji import HJIResidual
+from hno.losses.supervised import CostateDeviation, ValueDeviation
+from hno.operators import ValueOperator
+from hno.types import Extremal, Field, Labels, Points, Sample
+
+TERMS = (HJIResidual(), ValueDeviation(), CostateDeviation())
+"""What the rows are gradients of, at each point in this order."""
+BLOCK_BYTES = 2**28
+"""Memory for the two blocks of J that are multiplied."""
+
+Parameters = dict[str, Tensor]
+"""Parameters of an operator, or something for each of them, by name."""
+
+
+class TypeKernel(NamedTuple):
+    """The tangent kernel of an operator at one player type."""
+
+    theta: tuple[float, ...]
+    points: int
+    """Points whose residuals are its rows."""
+    block: int
+    """Rows of J that were held at a time, twice."""
+    kernel: Spectrum
+    """Of J J', the sum of trunk's and branch's."""
+    product: Spectrum
+    """Of the element-wise product of trunk's and branch's, which the paper calls the tangent kernel."""
+
+
+def type_kernel(operator: ValueOperator, found: Extremal, rows: int, seed: int = 0) -> TypeKernel:
+    """The tangent kernel at points drawn along labels of one type.
+
+    The end of the game is left out: where the boundary condition holds by construction, nothing can be learned there.
+
+    Args:
+        operator: whose parameters; it is not changed.
+        found: labels of one type.
+        rows: of the kernel, at most; fewer if the labels have fewer points.
+        seed: of the draw, which is without replacement.
+
+    Raises:
+        ValueError: labels of several types, or fewer rows than one point has.
+        NoLabelsError: no label converged.
+    """
+    sample, each = rows_of(operator.game, [found]), rows_per_point(operator)
+    sample = sample.rows(sample.points.tau > 0)
+    if rows < each:
+        raise ValueError(f"A tangent kernel has {each} rows for each point; got {rows} rows, which is less than one.")
+    if len(found.theta.unique(dim=0)) != 1:
+        raise ValueError("A tangent kernel is that of one type; pass the labels of each type on their own.")
+    drawn = torch.randperm(sample.size, generator=torch.Generator().manual_seed(seed))[: rows // each]
+    trunk, branch = tangent_kernels(operator, sample.rows(drawn))
+    kernel = trunk + branch
+    product = trunk.mul_(branch)
+    del branch
+    block = min(len(drawn), points_per_block(operator)) * each
+    return TypeKernel(tuple(found.theta[0].tolist()), len(drawn), block, spectrum(kernel), spectrum(product))
+
+
+def rows_per_point(operator: ValueOperator) -> int:
+    """Residuals of all players at one point: HJI, value and every costate."""
+    players, states = operator.game.players, operator.game.state_dim
+    return players * (2 + players * states)
+
+
+def points_per_block(operator: ValueOperator, memory: int = BLOCK_BYTES) -> int:
+    """Points of which two blocks of J take no more than `memory` bytes, but at least one."""
+    row = 8 * sum(parameter.numel() for parameter in operator.net.parameters())
+    return max(1, memory // (2 * row * rows_per_point(operator)))
+
+
+def tangent_kernels(operator: ValueOperator, sample: Sample, memory: int = BLOCK_BYTES) -> tuple[Tensor, Tensor]:
+    """J J' over the parameters of the trunk and over those of the branch; the tangent kernel is their sum.
+
+    J is never there as a whole: blocks of its rows are computed as they are needed, again for every pair of them, which
+    costs little beside their product.
+
+    Args:
+        operator: see `type_kernel`.
+        sample: B labelled points of one type.
+        memory: bytes for two blocks.
+
+    Returns:
+        Two matrices (N, N) in float64, N = B * `rows_per_point`; the rows of a point follow each other.
+    """
+    each = rows_per_point(operator)
+    blocks = torch.arange(sample.size).split(points_per_block(operator, memory))
+    places = [slice(each * int(block[0]), each * (int(block[-1]) + 1)) for block in blocks]
+    trunk, branch = (operator.value_scale.new_zeros((each * sample.size,) * 2, dtype=torch.float64) for _ in range(2))
+    for row, (here, block) in enumerate(zip(places, blocks, strict=True)):
+        ours = jacobian(operator, sample.rows(block))
+        for there, other in zip(places[: row + 1], blocks[: row + 1], strict=True):
+            theirs = ours if other is block else jacobian(operator, sample.rows(other))
+            for kernel, part in ((trunk, "net.trunk."), (branch, "net.branch.")):
+                product = sum(ours[name] @ theirs[name].mT for name in ours if name.startswith(part))
+                assert isinstance(product, Tensor)
+                kernel[here, there] = product
+                kernel[there, here] = product.mT
+    return trunk, branch
+
+
+def jacobian(operator: ValueOperator, sample: Sample) -> Parameters:
+    """Gradients of all residuals at some points, (B * `rows_per_point`, size of the parameter) for each parameter.
+
+    Args:
+        operator: see `type_kernel`.
+        sample: B labelled points of one type.
+    """
+    operator = copy.deepcopy(operator).double()
+    parameters = {name: tensor.detach() for name, tensor in operator.net.named_parameters(prefix="net")}
+    labels, like = sample.labels, operator.value_scale
+    assert labels is not None
+    theta = sample.points.theta[0].to(like)
+
+    def gradients(tau: Tensor, x: Tensor, value: Tensor, costate: Tensor) -> Parameters:
+        point = Sample(Points(tau, x, theta), Labels(value, costate))
+        return jacrev(lambda changed: residuals(operator, changed, point))(parameters)
+
+    columns = sample.points.tau, sample.points.x, labels.value, labels.costate
+    found = vmap(gradients)(*(column.to(like) for column in columns))
+    return {name: gradient.reshape(gradient.shape[:2].numel(), -1) for name, gradient in found.items()}
+
+
+def residuals(operator: ValueOperator, parameters: Parameters, point: Sample) -> Tensor:
+    """All residuals at one point, in the sizes that the loss measures them in, (`rows_per_point`,).
+
+    Derivatives in the point are those of `operator.forward`: `operator.field` has a derivative written by hand, which
+    torch.func cannot differentiate.
+
+    Args:
+        operator: everything but the parameters.
+        parameters: of its net, their names beginning with "net.".
+        point: labelled, without a batch axis.
+    """
+    tau, x, theta = point.points
+
+    def value(tau: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
+        batch = tau.unsqueeze(0), x.unsqueeze(0), theta.unsqueeze(0)
+        found = functional_call(operator, parameters, batch).squeeze(0)
+        return found, found
+
+    (in_time, in_state), found = jacrev(value, argnums=(0, 1), has_aux=True)(tau, x)
+    game, field, scales = (
+        operator.game,
+        Field(found, in_time, in_state),
+        Scales(operator.value_scale, operator.costate_scale),
+    )
+    parts = [term.residual(game, point, field) / term.scale(game, point, scales) for term in TERMS]
+    return torch.cat([part.flatten() for part in parts])

@@ -1,0 +1,130 @@
+"""Where a value function satisfies the Hamilton-Jacobi-Isaacs equation, and where it does not."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from hno.data.rows import rows_of
+from hno.data.sampling import sample_states
+from hno.evaluation.metrics import BinnedMean
+from hno.games import Game
+from hno.losses import Scales
+from hno.losses.hji import HJIResidual
+from hno.operators import ValueOperator
+from hno.types import Extremal, Points, Sample, Status
+
+REGIONS = ("start box", "PDE box", "constraint band", "around labels", "along labels")
+"""Uniform starts at the beginning; uniform in the PDE box; near the surface constraint = 0; nodes of labels with noise,
+as the sampler of collocation points makes them (`hno.data.sampling`); the nodes themselves."""
+BINS = 4
+"""Equal parts of the horizon by which residuals are reported."""
+
+
+class ResidualRow(NamedTuple):
+    """The HJI residual at one type in one region; numbers that do not exist are None."""
+
+    theta: tuple[float, ...]
+    """Player types."""
+    seen: bool
+    """Whether the operator was trained with labels of these types."""
+    region: str
+    """One of `REGIONS`."""
+    points: int
+    """How many points; 0 at labels of which none converged."""
+    physical: float | None
+    """Mean over points and players of the residual's absolute value, 1/s."""
+    scaled: float | None
+    """The same of the residual as the loss scales it: relative to values per horizon plus the penalty at the point."""
+    tau: tuple[float, ...]
+    """Edges of bins of time to go, s."""
+    points_by_tau: tuple[int, ...]
+    """Points in each bin."""
+    physical_by_tau: tuple[float | None, ...]
+    """As `physical`, bin by bin."""
+    scaled_by_tau: tuple[float | None, ...]
+    """As `scaled`, bin by bin."""
+
+
+def residual_table(
+    operator: ValueOperator, labels: Sequence[Extremal], points: int = 4096, seed: int = 0, bins: int = BINS
+) -> list[ResidualRow]:
+    """The residual by type, region and time to go.
+
+    Args:
+        operator: the value function.
+        labels: one set per type; the converged ones are a region.
+        points: in each other region.
+        seed: of the points, which are the same whatever other types there are.
+        bins: of time to go.
+    """
+    seen = {tuple(float(t) for t in theta) for theta in operator.seen_types}
+    return [
+        _row(operator, tuple(float(t) for t in found.theta[0]), seen, region, where, bins)
+        for found in labels
+        for region, where in zip(REGIONS, _regions(operator.game, found, points, seed), strict=True)
+    ]
+
+
+def _regions(game: Game, found: Extremal, size: int, seed: int) -> Iterator[Points]:
+    """Points of each of `REGIONS`, each from the same seed."""
+    types = found.theta[:1].float().expand(size, -1)
+
+    def sampled(source: str, pools: Mapping[str, tuple[Tensor, Tensor]]) -> Points:
+        return sample_states(game, types, {source: 1.0}, pools, 1.0, torch.Generator().manual_seed(seed))
+
+    starts = game.initial_box.sample(size, torch.Generator().manual_seed(seed))
+    yield Points(torch.full((size,), game.horizon), starts, types)
+    yield sampled("box", {})
+    yield sampled("band", {})
+    if bool((found.status == Status.CONVERGED).any()):
+        nodes = rows_of(game, [found]).points
+        yield sampled("labels", {"labels": (nodes.tau, nodes.x)})
+        yield nodes
+    else:
+        nothing = Points(types[:0, 0], found.x[:0, 0].float(), types[:0])
+        yield from (nothing, nothing)
+
+
+def _row(
+    operator: ValueOperator,
+    theta: tuple[float, ...],
+    seen: set[tuple[float, ...]],
+    region: str,
+    where: Points,
+    bins: int,
+) -> ResidualRow:
+    horizon = operator.game.horizon
+    place = (where.tau / horizon * bins).long().clamp(0, bins - 1)
+    physical, scaled = BinnedMean(bins), BinnedMean(bins)
+    residual, scale = hji(operator, where) if len(where.tau) > 0 else (where.theta, where.theta)
+    physical.update(residual, place)
+    scaled.update(residual / scale, place)
+    return ResidualRow(
+        theta=theta,
+        seen=theta in seen,
+        region=region,
+        points=len(where.tau),
+        physical=_number(physical.total.sum() / physical.count.sum()),
+        scaled=_number(scaled.total.sum() / scaled.count.sum()),
+        tau=tuple(horizon * k / bins for k in range(bins + 1)),
+        points_by_tau=tuple(torch.bincount(place, minlength=bins).tolist()),
+        physical_by_tau=tuple(map(_number, physical.compute())),
+        scaled_by_tau=tuple(map(_number, scaled.compute())),
+    )
+
+
+@torch.no_grad()
+def hji(operator: ValueOperator, points: Points) -> tuple[Tensor, Tensor]:
+    """The HJI residual, 1/s, and the size that the loss measures it in, both (B, P)."""
+    term, sample = HJIResidual(), Sample(points)
+    residual = term.residual(operator.game, sample, operator.field(points))
+    scale = term.scale(operator.game, sample, Scales(operator.value_scale, operator.costate_scale))
+    return residual, scale.expand_as(residual)
+
+
+def _number(value: Tensor) -> float | None:
+    return None if bool(value.isnan()) else float(value)

@@ -1,0 +1,147 @@
+"""What loggers are given, and which may be chosen."""
+
+from __future__ import annotations
+
+import csv
+import json
+import logging
+from pathlib import Path
+from typing import Any
+
+import lightning.fabric.loggers.tensorboard as fabric
+import pytest
+from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
+from PIL import Image
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from hno.cli import media
+from hno.cli.media import numbers, publish
+from tests.cli.conftest import SMOKE, Command, refused
+from tests.cli.wandb_file import offline_run
+from tests.report.tables import episode, type_row
+
+
+def results(*table: dict[str, Any], **entries: Any) -> dict[str, Any]:
+    names = {"game": "narrow_road", "operator": "sno", "activation": "tanh", "seed": 0}
+    return {**names, "status": "finished", "reason": None, "seconds": {"training": 53.0}, "table": table, **entries}
+
+
+def last_row(folder: Path) -> dict[str, str]:
+    """The one row of final results."""
+    with (folder / "csv" / "metrics.csv").open() as file:
+        *_, before, last = [{}, *csv.DictReader(file)]
+    assert not before.get("test/safe_starts")
+    return last
+
+
+def events(folder: Path) -> EventAccumulator:
+    return EventAccumulator(str(folder / "tensorboard")).Reload()
+
+
+def test_numbers_name_every_type_the_worst_one_and_the_seconds() -> None:
+    table = type_row((1, 1), 1, 100), type_row((1, 2.5), 2, 100), type_row((5, 5), 0, 0)
+    assert numbers(results(*table, validation={"collision_rate": 0.01, "excess": 0.02})) == {
+        "test/collision_rate": 0.015, "test/worst_type": 0.02, "test/excess_cost": 0.1, "test/safe_starts": 200,
+        "best/collision_rate": 0.01, "best/excess_cost": 0.02, "collision_rate/1,1": 0.01,
+        "collision_rate/1,2.5": 0.02, "seconds/training": 53.0,
+    }  # fmt: skip
+
+
+def test_what_does_not_exist_is_left_out() -> None:
+    table = (type_row((5, 5), 0, 0),)
+    assert numbers(results(*table, validation=None)) == {"test/safe_starts": 0, "seconds/training": 53}
+
+
+def test_csv_and_tensorboard_together_get_numbers_and_pictures(command: Command) -> None:
+    run = command("train", *SMOKE, "trainer.max_steps=2", "logger.names=[csv,tensorboard,csv]")
+    assert run.code == 0, run.text
+    wanted = numbers(run.results)
+    assert wanted.keys() >= {"test/collision_rate", "collision_rate/1,1", "seconds/labels"}
+    row = last_row(run.folder)
+    assert {name: float(row[name]) for name in wanted} == pytest.approx(wanted)
+    found = events(run.folder)
+    scalars = {name: found.Scalars(name)[-1] for name in found.Tags()["scalars"]}
+    assert {name: scalars[name].value for name in wanted} == pytest.approx(wanted)
+    assert scalars["test/collision_rate"].step == run.results["steps"] == 2
+    assert "loss/total" not in wanted
+    assert "loss/total" in scalars
+    assert found.Tags()["images"] == ["collision_map"]
+    assert found.Images("collision_map")[0].encoded_image_string.startswith(b"\x89PNG")
+
+
+def test_csv_alone_draws_nothing(command: Command) -> None:
+    run = command("train", *SMOKE, "trainer.max_steps=1")
+    assert not list(run.folder.glob("collision_map*"))
+    assert float(last_row(run.folder)["test/safe_starts"]) == 4
+
+
+def test_wandb_gets_pictures_and_the_worst_stored_episode_animated(command: Command, monkeypatch: Any) -> None:
+    stored = {"episodes": [episode((1, 5), 0.4), episode((1, 1), -0.2), episode((5, 5), 0.1)]}
+
+    def with_episodes(loggers: Any, content: dict[str, Any], folder: Path, step: int) -> None:
+        (folder / "episodes.json").write_text(json.dumps(stored))
+        Image.new("RGB", (9, 9)).save(folder / "rollout.png")
+        publish(loggers, {**content, "episodes": "episodes.json"}, folder, step)
+
+    monkeypatch.setattr("hno.cli.train.publish", with_episodes)
+    titles = []
+    monkeypatch.setattr(
+        media, "animate", lambda shown, path, title: titles.append(title) or path.write_bytes(b"GIF89a")
+    )
+    run = command("train", *SMOKE, "trainer.max_steps=1", "logger=wandb")
+    assert run.code == 0, run.text
+    assert titles == ["narrow_road / hno / tanh\nsmallest clearance, -0.20 m at (1,1)"]
+    kept = {path.name.split("_")[0] for path in run.folder.glob("wandb/offline-run-*/files/media/*/*.[gp][in][fg]")}
+    assert kept == {"worst", "rollout", "collision"}
+    summary = offline_run(run.folder).summary
+    assert summary.keys() >= {"worst_episode/videos", "rollout/filenames", "collision_map/filenames"}
+    assert (summary["types/nrows"], summary["test/worst_theta"]) == (1, "1,1")
+
+
+def test_a_logger_that_refuses_costs_a_warning_not_the_run(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    class Full(CSVLogger):
+        def log_metrics(self, *_: Any, **__: Any) -> None:
+            raise OSError(28, "No space left on device")
+
+    good = CSVLogger(tmp_path, name="", version="csv")
+    publish([Full(tmp_path / "full"), good], results(type_row((1, 1), 1, 10)), tmp_path, 7)
+    assert [(r.levelno, "No space left" in r.getMessage()) for r in caplog.records] == [(logging.WARNING, True)]
+    assert float(last_row(tmp_path)["collision_rate/1,1"]) == 0.1
+
+
+def test_games_of_three_get_no_map_and_the_reason(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.INFO):
+        board = TensorBoardLogger(tmp_path, name="", version="tensorboard")
+        publish([board], results(type_row((1, 1, 1), 0, 10)), tmp_path, 1)
+    assert "two players" in caplog.text
+    assert events(tmp_path).Scalars("collision_rate/1,1,1")[0].value == 0
+
+
+@pytest.mark.usefixtures("no_labels")
+def test_tensorboard_that_is_not_installed(command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fabric, "_TENSORBOARD_AVAILABLE", False)
+    monkeypatch.setattr(fabric, "_TENSORBOARDX_AVAILABLE", False)
+    run = command("train", *SMOKE, "logger=tensorboard")
+    refused(run, "TensorBoard is not installed: pip install 'hno[tensorboard]'", "logger=csv")
+    assert run.results["reason"].startswith("LoggerMissingError")
+
+
+@pytest.mark.usefixtures("no_labels")
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("logger.names=[csv,tensorbord]", "Did you mean 'tensorboard'?"),
+        ("logger.names=[csv,7]", "No logger named '7'"),
+        ("logger.names=csv", "logger.names must be a list, such as [csv,wandb]; got 'csv'"),
+        ("logger.names=null", "logger.names must be a list"),
+        ("logger.mode=online", "W&B has no API key to run online"),
+    ],
+)
+def test_loggers_that_cannot_be(command: Command, override: str, message: str) -> None:
+    refused(command("train", *SMOKE, "logger=wandb", override), message)
+
+
+def test_without_any_logger(command: Command) -> None:
+    run = command("train", *SMOKE, "trainer.max_steps=1", "logger.names=[]")
+    assert run.code == 0, run.text
+    assert not (run.folder / "csv").exists()

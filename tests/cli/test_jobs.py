@@ -1,0 +1,119 @@
+"""What is printed at the end of a multirun."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hno.cli import train
+from hno.cli.sweep import Job, show_jobs
+from tests.cli.conftest import SMOKE, Command, Outcome
+from tests.report.tables import type_row
+
+
+def job(root: Path, number: int, settings: tuple[str, ...] = (), **entries: Any) -> Job:
+    """A job that left results."""
+    folder = root / str(number)
+    folder.mkdir()
+    head = {"status": "finished", "reason": None, "operator": "sno", "activation": "tanh", "seed": 0, "seconds": {}}
+    (folder / "results.json").write_text(json.dumps({**head, "table": [], **entries}))
+    return Job(number, folder, settings)
+
+
+def lines(printed: str) -> list[list[str]]:
+    """Rows of the table, by words."""
+    return [line.split() for line in printed.splitlines() if line.rstrip().endswith((" finished", " failed"))]
+
+
+def test_jobs_are_sorted_and_pooled_over_types(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    table = [type_row((1, 1), 1, 100), type_row((2.5, 5), 3, 100)]
+    jobs = [
+        job(tmp_path, 0, game="narrow_road", seed=10, table=table, seconds={"labels": 1.6, "training": 60.0}),
+        job(tmp_path, 1, game="narrow_road", seed=2, table=[type_row((1, 1), 0, 0)]),
+        job(tmp_path, 2, game="drone", seed=3, table=[type_row((1, 1), 0, 600)]),
+    ]
+    show_jobs(jobs)
+    printed = capsys.readouterr().out
+    assert [" ".join(row) for row in lines(printed)] == [
+        "2 drone sno tanh 3 0 of 600 0.00 to 0.61 % 0.00 % +10.0 % n/a finished",
+        "1 narrow_road sno tanh 2 n/a n/a n/a n/a n/a finished",
+        "0 narrow_road sno tanh 10 4 of 200 0.55 to 5.04 % 3.00 % at 2.5, 5 +10.0 % 62 finished",
+    ]
+    assert printed.splitlines()[-1] == f"Page: python -m hno.report {tmp_path}"
+
+
+def test_only_settings_that_differ_are_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    common = ("game=drone", "trainer.max_steps=5")
+    jobs = [job(tmp_path, n, (*common, f"seed={n}", f"optimizer.lr={n}"), game="drone", seed=n) for n in range(2)]
+    show_jobs(jobs)
+    printed = capsys.readouterr().out
+    assert [row[5] for row in lines(printed)] == ["optimizer.lr=0", "optimizer.lr=1"]
+    assert "max_steps" not in printed
+    assert "seed=" not in printed
+
+
+@pytest.mark.parametrize("content", ["", "[1", "null"])
+def test_a_job_without_readable_results_is_a_failed_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], content: str
+) -> None:
+    broken = job(tmp_path, 0)
+    (broken.folder / "results.json").write_text(content)
+    gone = Job(1, tmp_path / "nowhere", ())
+    show_jobs([broken, gone])
+    printed = capsys.readouterr().out
+    assert [row[-1] for row in lines(printed)] == ["failed", "failed"]
+    assert printed.count("no results (") == 2
+
+
+def test_a_failed_job_is_in_the_table_with_its_reason_and_the_others_go_on(command: Command, tmp_path: Path) -> None:
+    sweep = tmp_path / "sweep"
+    run = command("train", "-m", f"hydra.sweep.dir={sweep}", *SMOKE, "trainer.max_steps=2", "optimizer.lr=inf,0.001")
+    assert run.code == 1
+    table = run.text[run.text.index("2 jobs") :]
+    assert [(row[0], row[5], row[-1]) for row in lines(table)] == [
+        ("0", "optimizer.lr=inf", "failed"), ("1", "optimizer.lr=0.001", "finished"),
+    ]  # fmt: skip
+    assert "Job 0 failed: DivergedError: " in table
+    assert table.splitlines()[-1] == f"Page: python -m hno.report {sweep}"
+
+
+def test_a_job_whose_configuration_cannot_be_resolved_fails_alone(command: Command, tmp_path: Path) -> None:
+    """Adam has no such entry, SOAP has."""
+    sweep = f"hydra.sweep.dir={tmp_path}/sweep"
+    entry = "trainer.max_steps=${optimizer.precondition_frequency}"
+    run = command("train", "-m", sweep, *SMOKE, entry, "optimizer=adam,soap", "hydra.sweeper.max_batch_size=1")
+    assert run.code == 1
+    found = [Outcome(0, "", folder).results for folder in sorted((tmp_path / "sweep").glob("[0-9]*"))]
+    assert [results["status"] for results in found] == ["failed", "finished"]
+    assert "optimizer.precondition_frequency" in found[0]["reason"]
+    assert (found[0]["game"], found[0]["operator"]) == ("narrow_road", "hno")
+    assert "Job 0 failed: Interpolation" in run.text
+    assert "Traceback" not in run.text
+
+
+def test_an_interrupted_multirun_shows_what_there_is(
+    command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    outcomes = iter([True, KeyboardInterrupt()])
+
+    def task(config: object) -> bool:
+        outcome = next(outcomes)
+        if isinstance(outcome, BaseException):
+            raise outcome
+        return outcome
+
+    monkeypatch.setattr(train, "train", task)
+    printed: list[int] = []
+    monkeypatch.setattr("hno.cli.config.show_jobs", lambda jobs: printed.extend(job.number for job in jobs))
+    with pytest.raises(KeyboardInterrupt):
+        command("train", "-m", f"hydra.sweep.dir={tmp_path}/sweep", *SMOKE, "seed=0,1,2")
+    assert printed == [0, 1]
+
+
+def test_a_single_run_ends_with_how_to_see_it(command: Command) -> None:
+    run = command("train", *SMOKE, "trainer.max_steps=1")
+    assert " jobs" not in run.text
+    assert f"Page: python -m hno.report {run.folder}" in run.text.splitlines()

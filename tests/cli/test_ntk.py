@@ -1,0 +1,76 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from hno.cli.ntk import ntk_section, ntk_table
+from hno.evaluation.spectrum import spectrum, summary
+from hno.games import make
+from hno.operators import operators
+from hno.types import Status
+from tests.cli.conftest import Command, refused
+from tests.fakes import fake_labels
+
+FAST = ("workers=1", "starts=4", "dt=0.1")
+
+
+def test_the_kernel_at_training_types_is_in_the_results(command: Command, random_checkpoint: Path) -> None:
+    run = command("evaluate", f"checkpoint={random_checkpoint}", "theta=1,1;1,2", "ntk=true", "ntk_rows=65", *FAST)
+    assert run.code == 0, run.text
+    section = run.results["ntk"]
+    assert [(entry["theta"], entry["points"], entry["block"], entry["reason"]) for entry in section] == [
+        ([1, 1], 3, 60, None)
+    ]
+    assert run.results["seconds"]["ntk"] > 0
+    for kind in ("kernel", "product"):
+        found = section[0][kind]
+        assert found["rows"] == 60
+        assert found["cutoff"] == 60 * 2.0**-52
+        assert found["condition"] == pytest.approx(found["curve"][0][1] / found["curve"][-1][1])
+        assert 1 <= found["effective_rank"] <= found["rank"] <= 60
+    assert "Neural tangent kernel" in run.text
+    assert "paper's product" in run.text
+
+
+def test_no_kernel_unless_asked_for(command: Command, random_checkpoint: Path) -> None:
+    run = command("evaluate", f"checkpoint={random_checkpoint}", "theta=1,2", *FAST)
+    assert run.code == 0, run.text
+    assert "ntk" not in run.results
+    assert "tangent" not in run.text
+
+
+@pytest.mark.usefixtures("no_labels")
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["ntk=yes please"], "ntk must be true or false; got 'yes please'"),
+        (["ntk=true", "ntk_rows=19"], "ntk_rows must be a whole number of at least 20, the rows of one point; got 19"),
+        (["ntk=true", "ntk_rows=many"], "ntk_rows must be"),
+        (["ntk=true", "theta=1,2"], 'needs a type of the training run among theta; these are "1,1"'),
+    ],
+)
+def test_impossible_settings(command: Command, random_checkpoint: Path, overrides: list[str], message: str) -> None:
+    refused(command("evaluate", f"checkpoint={random_checkpoint}", *overrides, *FAST), message)
+
+
+def test_a_type_without_labels_says_why() -> None:
+    torch.manual_seed(0)
+    operator = operators.get("sno")(make("narrow_road"), width=8, depth=1)
+    operator.seen_types = [(1.0, 1.0), (1.0, 5.0)]
+    failed = fake_labels(operator.game, (1.0, 1.0), status=[Status.STALLED] * 4)
+    labels = [failed, fake_labels(operator.game, (1.0, 5.0)), fake_labels(operator.game, (3.0, 3.0))]
+    section = ntk_section(operator, labels, OmegaConf.create({"ntk_rows": 40, "seed": 0}))
+    assert [(entry["theta"], entry["points"]) for entry in section] == [([1.0, 1.0], 0), ([1.0, 5.0], 2)]
+    assert (section[0]["kernel"], section[0]["product"]) == (None, None)
+    assert "None of 4 boundary value problems" in section[0]["reason"]
+    cells = [list(column.cells) for column in ntk_table(section).columns]
+    assert [column[0] for column in cells] == ["1, 1", "0", "J J'", *["n/a"] * 4]
+
+
+def test_a_kernel_that_is_cut_off_has_no_condition_number_in_the_table() -> None:
+    rank_one = summary(spectrum(torch.ones(4, 4, dtype=torch.float64)))
+    table = ntk_table([{"theta": [1, 1], "points": 1, "kernel": rank_one, "product": rank_one}])
+    assert [next(iter(column.cells)) for column in table.columns][3:6] == ["> 1.13e+15", "1 of 4", "1.0"]

@@ -1,0 +1,147 @@
+"""W&B sweeps and the paper's grid choose what exists."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import hydra
+import pytest
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+from wandb.sdk.launch.sweeps.utils import create_sweep_command, create_sweep_command_args
+
+from hno.cli import train
+from hno.cli.build import build_game, build_operator, check_numbers
+from hno.cli.config import config_dir, register_plugins
+from hno.cli.media import numbers
+from tests.cli.conftest import SMOKE, Command
+from tests.cli.test_train import losses
+from tests.report.tables import type_row
+
+SWEEPS = sorted((Path(__file__).parents[2] / "sweeps").glob("*.yaml"))
+GAMES, OPERATORS, ACTIVATIONS = ("narrow_road", "lane_change", "drone"), ("hno", "sno"), ("tanh", "sin", "relu")
+
+
+def read(path: Path) -> dict[str, Any]:
+    content = OmegaConf.to_container(OmegaConf.load(path), resolve=False)
+    assert isinstance(content, dict)
+    return content
+
+
+def values(parameter: dict[str, Any]) -> list[Any]:
+    """Values to try: all of a list, or both ends and the middle of a distribution."""
+    if "value" in parameter:
+        return [parameter["value"]]
+    if "values" in parameter:
+        return parameter["values"]
+    low, high = parameter["min"], parameter["max"]
+    assert low < high
+    assert low > 0 or "log" not in parameter["distribution"]
+    return [low, (low + high) / 2, high]
+
+
+def arguments(sweep: dict[str, Any], chosen: dict[str, Any]) -> list[str]:
+    """The command line that `wandb agent` makes of a sweep's `command`."""
+    given = create_sweep_command_args({"args": {name: {"value": value} for name, value in chosen.items()}})
+    macros = {**given, "env": ["/usr/bin/env"], "interpreter": ["python"], "program": [sweep["program"]]}
+    words = map(str, create_sweep_command(list(sweep["command"])))
+    return [
+        word
+        for part in words
+        for word in (macros[part[2:-1]] if part.startswith("${") and part.endswith("}") else [part])
+    ]
+
+
+@pytest.fixture
+def hydra_here() -> Iterator[None]:
+    register_plugins()
+    with hydra.initialize_config_dir(str(config_dir()), version_base="1.3"):
+        yield
+
+
+@pytest.mark.usefixtures("hydra_here")
+@pytest.mark.parametrize("path", SWEEPS, ids=lambda path: path.stem)
+def test_parameters_of_a_sweep_are_configuration_keys(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("WANDB_SWEEP_ID", "s1")
+    monkeypatch.setenv("WANDB_RUN_ID", "r1")
+    sweep = read(path)
+    trials = {name: values(parameter) for name, parameter in sweep["parameters"].items()}
+    first = {name: some[0] for name, some in trials.items()}
+    for name, some in trials.items():
+        for value in some:
+            env, python, program, *overrides = arguments(sweep, first | {name: value})
+            assert (env, python, program) == ("/usr/bin/env", "python", "train.py")
+            config = hydra.compose("train", overrides=overrides, return_hydra_config=True)
+            assert config.hydra.run.dir == "outputs/sweeps/s1/r1"
+            got = OmegaConf.select(config, name)
+            assert (got.name if OmegaConf.is_dict(got) else got) == value
+            with monkeypatch.context() as patch:
+                patch.setattr(HydraConfig, "get", lambda config=config: config.hydra)
+                check_numbers(config)
+    build_operator(config, build_game(config))
+
+
+def test_the_metric_of_every_sweep_is_logged(command: Command) -> None:
+    run = command("train", *SMOKE, "trainer.max_steps=2", "trainer.validate_every=1")
+    logged = set(losses(run.folder)[-1])
+    assert {read(path)["metric"]["name"] for path in SWEEPS} <= logged
+    assert all(read(path)["metric"]["goal"] == "minimize" for path in SWEEPS)
+    assert "test/collision_rate" in numbers({"table": [type_row((1, 1), 0, 9)], "seconds": {}})
+
+
+def test_grid_and_bayes_are_there() -> None:
+    assert [(path.stem, read(path)["method"]) for path in SWEEPS] == [("bayes", "bayes"), ("grid", "grid")]
+
+
+Grid = list[tuple[Any, ...]]
+
+
+@pytest.fixture
+def grid(command: Command, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Any]:
+    """Jobs of `experiment=paper_grid` with what is given on the command line, without running them."""
+
+    def jobs(*overrides: str) -> Grid:
+        made: Grid = []
+
+        def take(config: DictConfig) -> bool:
+            check_numbers(config)
+            tests = config.evaluation
+            made.append((
+                config.game.name, config.operator.name, config.activation.name, config.seed, config.optimizer.lr,
+                tests.starts, tests.safe, len(tests.types), config.trainer.max_steps,
+            ))  # fmt: skip
+            return True
+
+        monkeypatch.setattr(train, "train", take)
+        monkeypatch.setattr("hno.cli.config.show_jobs", lambda jobs: None)
+        run = command("train", *overrides, "experiment=paper_grid", f"hydra.sweep.dir={tmp_path}/sweep")
+        assert run.code == 0, run.text
+        return made
+
+    return jobs
+
+
+def test_the_papers_grid_takes_every_activation_at_its_own_rate(grid: Any) -> None:
+    rates = {"tanh": 3e-3, "sin": 3e-4, "relu": 3e-3}
+    starts = {"narrow_road": 200, "lane_change": 200, "drone": 60}
+    assert grid("-m", "seed=1") == [
+        (game, operator, activation, 1, rates[activation], starts[game], True, 25, 2000)
+        for game, operator, activation in product(GAMES, OPERATORS, ACTIVATIONS)
+    ]
+
+
+def test_the_command_line_narrows_the_grid(grid: Any) -> None:
+    made = grid("-m", "game=drone", "activation=sin", "operator=sno", "paper_grid.lr.sin=7e-4", "evaluation.starts=5")
+    assert made == [("drone", "sno", "sin", seed, 7e-4, 5, True, 25, 2000) for seed in range(3)]
+
+
+def test_one_cell_of_the_grid(grid: Any) -> None:
+    assert grid("activation=sin") == [("narrow_road", "sno", "sin", 0, 3e-4, 200, True, 25, 2000)]
+
+
+def test_games_and_activations_of_ones_own_have_a_place_in_the_grid(grid: Any) -> None:
+    made = grid("game.name=hallway", "activation.name=softplus")
+    assert made == [("hallway", "sno", "softplus", 0, 3e-3, 200, True, 25, 2000)]

@@ -1,0 +1,102 @@
+"""Conditions, and what they do to policies whose episodes are known."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import pytest
+import torch
+from torch import Tensor
+
+from hno.evaluation.closed_loop import collision_table
+from hno.evaluation.robustness import Condition, read_conditions, robustness_table
+from hno.evaluation.rollout import Disturbance
+from hno.games import make
+from hno.types import Extremal
+from tests.fakes import fake_labels
+from tests.walkers import Walkers
+
+
+def labelled(heights: Sequence[float], theta: float = 1.0, clearance: float = 0.5) -> Extremal:
+    start = torch.tensor([[[0.0, y], [0.0, y]] for y in heights])
+    return fake_labels(Walkers(), (theta, theta), len(heights), 0, None, [clearance] * len(heights), start)
+
+
+def straight(tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
+    """Walkers of one height miss each other by twice that."""
+    return torch.tensor([4.0, 0.0]).expand(len(x), 2, 2)
+
+
+SETS = [labelled([0.9, 0.05, 0.8]), labelled([0.9, 0.7], theta=2.0)]
+
+
+def test_the_undisturbed_line_repeats_the_collision_table() -> None:
+    (row,) = robustness_table(Walkers(), straight, [Condition("nothing")], lambda widen: SETS, 0.02, 0.02)
+    table = collision_table(Walkers(), straight, SETS, [])
+    assert (row.safe_starts, row.collisions, row.rate) == (5, 1, 0.2)
+    assert row.types == [
+        {"theta": entry.theta, "safe_starts": entry.safe_starts, "collisions": entry.collisions} for entry in table
+    ]
+    assert row.interval is not None
+    assert row.interval[0] < 0.2 < row.interval[1]
+    label_costs = torch.cat([-found.value[:, 0].sum(-1) for found in SETS])
+    assert row.median_label_cost == label_costs.median().item()
+
+
+def test_every_condition_plays_the_labels_of_its_width_and_its_own_disturbance() -> None:
+    asked: list[float] = []
+
+    def labels_of(widen: float) -> list[Extremal]:
+        asked.append(widen)
+        return [labelled([0.9] * (3 if widen == 1 else 4))]
+
+    conditions = [
+        Condition("plain"),
+        Condition("wide", 2.0),
+        Condition("pushed", disturbance=Disturbance(drift=0.4, seed=1)),
+    ]
+    plain, wide, pushed = robustness_table(Walkers(), straight, conditions, labels_of, 0.02, 0.1)
+    assert asked == [1.0, 2.0, 1.0]
+    assert (plain.safe_starts, wide.safe_starts, pushed.safe_starts) == (3, 4, 3)
+    assert (plain.disturbance, wide.disturbance, pushed.disturbance) == ({}, {}, {"drift": 0.4})
+    assert plain.median_excess_cost != pushed.median_excess_cost
+
+
+def test_without_safe_starts_there_are_no_rates() -> None:
+    nothing = [labelled([0.9, 0.8], clearance=-1.0)]
+    (row,) = robustness_table(Walkers(), straight, [Condition("any")], lambda widen: nothing, 0.02, 0.1)
+    assert (row.safe_starts, row.collisions) == (0, 0)
+    assert (row.rate, row.interval, row.median_excess_cost, row.median_label_cost) == (None, None, None, None)
+
+
+def test_entries_replace_those_of_the_table() -> None:
+    base = Condition("", 1.5, Disturbance(noise=0.1, delay=1, seed=7))
+    content = {"same": {}, "wide": {"widen": 2}, "wind": {"drift": 0.1, "components": [0, 1], "noise": 0}}
+    assert read_conditions(make("narrow_road"), content, base) == [
+        Condition("same", 1.5, base.disturbance),
+        Condition("wide", 2.0, base.disturbance),
+        Condition("wind", 1.5, Disturbance(0, 1, 7, drift=0.1, components=(0, 1))),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (None, "conditions must be names with entries"),
+        ({}, "conditions must be names with entries"),
+        ({"a": 0.2}, r"conditions.a must be entries such as \{noise: 0.2\}; got 0.2"),
+        ({"a": {"noisy": 1}}, r"conditions.a.noisy does not exist.*Did you mean 'noise'"),
+        ({"a": {"seed": 1}}, "conditions.a.seed does not exist"),
+        ({"a": {"noise": -0.1}}, "conditions.a.noise must be a finite number of at least 0; got -0.1"),
+        ({"a": {"gusts": float("nan")}}, "conditions.a.gusts must be a finite number"),
+        ({"a": {"drift": "strong"}}, "conditions.a.drift must be a finite number"),
+        ({"a": {"belief": True}}, "conditions.a.belief must be a finite number"),
+        ({"a": {"delay": 0.5}}, "conditions.a.delay must be a whole number"),
+        ({"a": {"widen": 0}}, "conditions.a.widen must be a positive number; got 0"),
+        ({"a": {"components": 2}}, "conditions.a.components must be a list of places"),
+        ({"a": {"components": [4]}}, r"0 to 3; got \[4\]"),
+    ],
+)
+def test_impossible_conditions(content: object, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        read_conditions(make("narrow_road"), content, Condition("base"))

@@ -1,0 +1,112 @@
+"""Two controllers side by side: counts, costs and times."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+import torch
+from torch import Tensor
+
+from hno.evaluation.rollout import Disturbance, rollout
+from hno.evaluation.yardstick import compare, driven, latency, safe_starts
+from hno.pontryagin import solve
+from hno.types import Extremal, Status
+from tests.fakes import fake_labels
+from tests.walkers import Walkers
+
+
+def straight(tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
+    """Walk along x at 4 m/s and into whoever comes."""
+    return torch.tensor([4.0, 0.0]).expand(len(x), 2, 2)
+
+
+def solved(*theta: float, count: int = 2) -> Extremal:
+    game = Walkers()
+    x0 = game.initial_box.sample(count, torch.Generator().manual_seed(0))
+    x0[..., 1] = 0.01  # head-on
+    return solve(game, x0, torch.tensor([theta]).expand(count, -1))
+
+
+def test_only_the_first_safe_starts_are_driven() -> None:
+    clearance = [0.5, -1.0, 0.01, 0.02, 0.5, 0.5]
+    status = [Status.CONVERGED] * 4 + [Status.STALLED, Status.CONVERGED]
+    found = fake_labels(Walkers(), (1.0, 1.0), 6, 0, status, clearance)
+    few, none = safe_starts([found, found._replace(clearance=-found.clearance - 9)], 2, clearance=0.02)
+    assert torch.equal(few.x, found.x[[0, 3]])
+    assert len(none.status) == 0
+
+
+def test_both_controllers_play_the_same_starts_and_the_solver_avoids_the_other() -> None:
+    types = [(0.0, 0.0), (2.0, 1.0), (4.0, 4.0)]
+    labels = [solved(*types[0], count=1), solved(*types[1]), solved(*types[2], count=1)]
+    labels[2] = safe_starts(labels[2:], 0, 0.02)[0]
+    rows = compare(Walkers(), straight, labels, types, interval=2, dt=0.1, disturbance=Disturbance(0.01, 0, 1))
+    assert [row.theta for row in rows] == [*types, None]
+    assert [row.policy.starts for row in rows] == [row.solver.starts for row in rows] == [1, 2, 0, 3]
+    assert [row.policy.collisions for row in rows] == [1, 2, 0, 3]
+    assert [row.solver.collisions for row in rows] == [0, 0, 0, 0]
+    assert [row.solves.solves for row in rows] == [5, 10, 0, 15]
+    assert [row.solves.failures for row in rows] == [0, 0, 0, 0]
+    assert (rows[2].solver.rate, rows[2].policy.interval, rows[2].solver.median_excess_cost) == (None, None, None)
+    assert rows[3].policy.rate == 1.0
+    assert rows[3].solver.interval == pytest.approx((0, 1 - 0.025 ** (1 / 3)))
+    for row in (rows[0], rows[1], rows[3]):
+        assert row.policy.median_excess_cost is not None
+        assert row.solver.median_excess_cost is not None
+        assert row.solver.median_excess_cost < row.policy.median_excess_cost
+
+
+def test_costs_are_compared_with_those_of_the_labels_row_by_row() -> None:
+    x0, theta = torch.zeros(4, 2, 2), torch.zeros(4, 2)
+    x0[:, :, 1] = torch.tensor([0.0, 0.5, 0.6, 0.7]).unsqueeze(-1)
+    played = rollout(Walkers(), straight, x0, theta, 0.1)
+    cost = -played.value.sum(-1).double()
+    found = driven(played, cost - torch.tensor([9.0, 1.0, 5.0, 2.0]), torch.tensor([1, 2, 3]))
+    assert (found.starts, found.collisions) == (3, 0)
+    assert found.median_excess_cost == pytest.approx(2)
+    assert found.largest_excess_cost == pytest.approx(5)
+    assert driven(played, cost, torch.arange(4)).collisions == 1
+
+
+def test_a_broken_policy_is_no_safe_one() -> None:
+    def broken(tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
+        return torch.full((len(x), 2, 2), torch.nan)
+
+    played = rollout(Walkers(), broken, torch.zeros(2, 2, 2), torch.zeros(2, 2), 0.1)
+    assert driven(played, torch.zeros(2), torch.arange(2)).collisions == 2
+
+
+class Slow:
+    """A policy that takes its time, longer for the first answer, and every second answer takes none."""
+
+    def __init__(self) -> None:
+        self.calls = 0
+
+    def __call__(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
+        assert torch.get_num_threads() == 1
+        assert len(x) == 1
+        if self.calls % 2 == 0:
+            time.sleep(0.01 if self.calls else 0.05)
+        self.calls += 1
+        return straight(tau, x, theta)
+
+
+def test_latency_is_of_one_game_on_one_thread_and_of_answers_that_count() -> None:
+    labels = [fake_labels(Walkers(), (1.0, 1.0), 3), fake_labels(Walkers(), (4.0, 1.0), 4)]
+    torch.set_num_threads(2)
+    try:
+        found = latency(Walkers(), Slow, labels, every=2, dt=0.1, episodes=3)
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(1)
+    assert (found.episodes, found.answers) == (3, 3 * 4)
+    assert 0.05 <= found.first < 0.2
+    assert 0.01 <= found.median <= found.slow
+    assert found.median < 0.04
+    assert found.processor < 0.008, "sleep takes no processor time"
+    assert found.rate == pytest.approx(1 / found.median)
+    assert latency(Walkers(), Slow, labels, dt=0.1, episodes=99).episodes == 7
+    assert latency(Walkers(), Slow, labels, dt=0.1, episodes=1).answers == 9
+    alone = latency(Walkers(), Slow, labels, every=99, dt=0.1, episodes=1)
+    assert (alone.answers, alone.median, alone.slow, alone.processor, alone.rate) == (0, None, None, None, None)
