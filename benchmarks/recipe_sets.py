@@ -50,7 +50,12 @@ FIFTEEN = str([[a, b] for a, b in itertools.combinations_with_replacement(range(
 TEN = f"{STEPS} {CORNERS} data.trajectories=10"
 ANY = f"{STEPS} {CORNERS} operator=hno data.interior_types=box data.trajectories=200"
 RECIPES: dict[str, dict[str, str]] = {
-    "default": {"sno": "operator=sno", "sno, 1e-2": "operator=sno optimizer.lr=1e-2", "hno": "operator=hno"},
+    "default": {
+        "sno": "operator=sno activation=tanh",
+        "sno, sin": "operator=sno activation=sin",
+        "sno, 1e-2": "operator=sno activation=tanh optimizer.lr=1e-2",
+        "hno": "operator=hno activation=tanh",
+    },
     "hypothesis": {
         "sno": f"{STEPS} operator=sno",
         "hno": f"{STEPS} operator=hno",

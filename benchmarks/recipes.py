@@ -124,8 +124,8 @@ def pooled(rows: Sequence[dict[str, Any]], suite: str) -> dict[str, Any]:
 def cell(found: dict[str, Any]) -> str:
     """Collisions, interval and excess in one cell."""
     low, high = found["interval"]
-    rate = 100 * found["collisions"] / found["starts"]
-    return f"{rate:.2f} % ({100 * low:.2f} to {100 * high:.2f}) of {found['starts']}, {100 * found['excess']:+.1f} %"
+    total = f"{found['collisions']} of {found['starts']:,}"
+    return f"{total} ({100 * low:.2f} to {100 * high:.2f} %), {100 * found['excess']:+.1f} %"
 
 
 def compared(

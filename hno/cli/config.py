@@ -18,6 +18,7 @@ from omegaconf import DictConfig
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
 import hno
+from hno.cli import pages
 from hno.cli.results import Results
 from hno.cli.sweep import Job, show_jobs
 from hno.games import games
@@ -87,7 +88,7 @@ def explain(error: Exception) -> str:
 def run_command(config_name: str, task: Callable[[DictConfig], bool]) -> None:
     """Run a task under Hydra, in every job of a multirun, and exit with 1 if one of them failed.
 
-    A multirun ends with a table of its jobs, also when it is interrupted.
+    A multirun ends with a table of its jobs, also when it is interrupted. The last line is the path of the page.
 
     Args:
         config_name: the root configuration.
@@ -98,11 +99,13 @@ def run_command(config_name: str, task: Callable[[DictConfig], bool]) -> None:
     register_plugins()
     outcomes: list[bool] = []
     jobs: list[Job] = []
+    folders: list[Path] = []
     os.environ["HYDRA_FULL_ERROR"] = "1"  # exceptions reach this function; it says what they mean
 
     def job(config: DictConfig) -> None:
         current = Job.current()
         jobs.extend([] if current is None else [current])
+        folders.append(Path(HydraConfig.get().runtime.output_dir))
         outcomes.append(_attempt(task, config))
 
     try:
@@ -116,6 +119,8 @@ def run_command(config_name: str, task: Callable[[DictConfig], bool]) -> None:
             show_jobs(jobs)
     if not all(outcomes):
         sys.exit(1)
+    if not jobs:
+        print(*map(pages.write, folders), sep="\n")
 
 
 def _attempt(task: Callable[[DictConfig], bool], config: DictConfig) -> bool:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import shlex
 import sys
 import traceback
 from collections.abc import Mapping, Sequence
@@ -31,7 +30,7 @@ WIDTH = 140
 
 
 def show(results: Mapping[str, Any], folder: Path) -> None:
-    """Print the tables and the sections of every model, the totals, where everything lies and how to see it."""
+    """Print the tables and the sections of every model, the totals and where everything lies."""
     console = Console(width=None if sys.stdout.isatty() else WIDTH)
     models = results.get("models", [results])
     names = short_names([str(model["checkpoint"]) for model in models]) if len(models) > 1 else [""]
@@ -40,12 +39,7 @@ def show(results: Mapping[str, Any], folder: Path) -> None:
     if "comparison" in results:
         show_comparison(results["comparison"], console)
     spent = ", ".join(f"{part.replace('_', ' ')} {seconds:.0f} s" for part, seconds in results["seconds"].items())
-    console.print(f"Time: {spent}\nResults: {folder / 'results.json'}\n{where(folder)}", soft_wrap=True)
-
-
-def where(folder: Path) -> str:
-    """How to see a run or a sweep."""
-    return f"Page: python -m hno.report {shlex.quote(str(folder))}"
+    console.print(f"Time: {spent}\nResults: {folder / 'results.json'}", soft_wrap=True)
 
 
 def _show_model(model: Mapping[str, Any], clearance: float, name: str, console: Console) -> None:

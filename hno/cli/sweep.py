@@ -13,7 +13,7 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from hno.cli.summary import where
+from hno.cli import pages
 from hno.cli.tables import percent
 from hno.report.totals import totals
 
@@ -55,7 +55,7 @@ class Job(NamedTuple):
 
 
 def show_jobs(jobs: Sequence[Job]) -> None:
-    """Print a table over all jobs, why jobs failed, and where everything lies."""
+    """Print a table over all jobs, why jobs failed, and where their page lies."""
     chosen = _differences(jobs)
     rows = [(job, found, chosen[job.number]) for job, found in sorted(((j, j.results()) for j in jobs), key=_order)]
     extra = ("settings",) if any(chosen.values()) else ()
@@ -72,7 +72,7 @@ def show_jobs(jobs: Sequence[Job]) -> None:
             console.print(
                 f"Job {job.number} {found['status']}: {reason}", soft_wrap=True, markup=False, highlight=False
             )
-    console.print(where(jobs[0].folder.parent), soft_wrap=True, markup=False, highlight=False)
+    console.print(pages.write(jobs[0].folder.parent), soft_wrap=True, markup=False, highlight=False)
 
 
 def _order(entry: tuple[Job, Mapping[str, Any]]) -> tuple[str, str, str, int, int]:

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import pytest
 import torch
 
-from hno.cli import evaluate, starts, train
+from hno.cli import evaluate, pages, starts, train
 from hno.data import datamodule
 from hno.games import make
 from hno.operators import operators
@@ -60,10 +60,20 @@ def clean_globals() -> Iterator[None]:
 
 
 @pytest.fixture
+def no_pages(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Commands say where their page would be, without the seconds that it takes."""
+    monkeypatch.setattr(pages, "write", lambda folder: f"Page: {folder}")
+
+
+@pytest.fixture
 def command(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path, clean_globals: None
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    clean_globals: None,
+    no_pages: None,
 ) -> Command:
-    """Run train.py or evaluate.py in this process, as the command line would, but without drawing pictures."""
+    """Run train.py or evaluate.py in this process, as the command line would, but without pictures and pages."""
     monkeypatch.setattr(evaluate, "draw", lambda *arguments: None)
     mains = {"train": train.main, "evaluate": evaluate.main}
 

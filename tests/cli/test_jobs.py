@@ -23,6 +23,9 @@ def job(root: Path, number: int, settings: tuple[str, ...] = (), **entries: Any)
     return Job(number, folder, settings)
 
 
+pytestmark = pytest.mark.usefixtures("no_pages")
+
+
 def lines(printed: str) -> list[list[str]]:
     """Rows of the table, by words."""
     return [line.split() for line in printed.splitlines() if line.rstrip().endswith((" finished", " failed"))]
@@ -42,7 +45,7 @@ def test_jobs_are_sorted_and_pooled_over_types(tmp_path: Path, capsys: pytest.Ca
         "1 narrow_road sno tanh 2 n/a n/a n/a n/a n/a finished",
         "0 narrow_road sno tanh 10 4 of 200 0.55 to 5.04 % 3.00 % at 2.5, 5 +10.0 % 62 finished",
     ]
-    assert printed.splitlines()[-1] == f"Page: python -m hno.report {tmp_path}"
+    assert printed.splitlines()[-1] == f"Page: {tmp_path}"
 
 
 def test_only_settings_that_differ_are_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -77,7 +80,7 @@ def test_a_failed_job_is_in_the_table_with_its_reason_and_the_others_go_on(comma
         ("0", "optimizer.lr=inf", "failed"), ("1", "optimizer.lr=0.001", "finished"),
     ]  # fmt: skip
     assert "Job 0 failed: DivergedError: " in table
-    assert table.splitlines()[-1] == f"Page: python -m hno.report {sweep}"
+    assert table.splitlines()[-1] == f"Page: {sweep}"
 
 
 def test_a_job_whose_configuration_cannot_be_resolved_fails_alone(command: Command, tmp_path: Path) -> None:
@@ -113,7 +116,13 @@ def test_an_interrupted_multirun_shows_what_there_is(
     assert printed == [0, 1]
 
 
-def test_a_single_run_ends_with_how_to_see_it(command: Command) -> None:
+def test_a_single_run_ends_with_its_page(command: Command) -> None:
     run = command("train", *SMOKE, "trainer.max_steps=1")
     assert " jobs" not in run.text
-    assert f"Page: python -m hno.report {run.folder}" in run.text.splitlines()
+    assert f"Page: {run.folder}" in run.text.splitlines()
+
+
+def test_a_failed_run_has_no_page(command: Command) -> None:
+    run = command("train", *SMOKE, "trainer.max_steps=2", "optimizer.lr=inf")
+    assert run.code == 1
+    assert "Page:" not in run.text

@@ -1,0 +1,28 @@
+"""The page that a command leaves behind."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+
+from hno.report.runs import NoRunsError, load
+
+PAGE = "report.html"
+
+
+def write(folder: Path) -> str:
+    """Write the page of a run or of a sweep into its folder.
+
+    Returns:
+        A line that says where it lies, or what to do where it could not be written.
+    """
+    again = f"python -m hno.report {shlex.quote(str(folder))}"
+    try:
+        from hno.report.page import write_page
+
+        write_page(load(folder), folder / PAGE)
+    except ModuleNotFoundError as error:
+        return f"Page: needs the package {error.name}: pip install 'hno[report]', then {again}"
+    except (NoRunsError, OSError) as error:
+        return f"Page: could not be written ({error}). Later: {again}"
+    return f"Page: {folder / PAGE}"
