@@ -18,7 +18,7 @@ from hno.types import Extremal, Trajectory
 EPISODES = "episodes.json"
 """Name of their file inside a run's folder."""
 FRAMES = 50
-"""An episode is kept at about so many times."""
+"""An episode is kept at about so many times, and where players are closest."""
 
 
 def episodes(game: Game, played: Sequence[Trajectory], labels: Sequence[Extremal], clearance: float) -> dict[str, Any]:
@@ -52,8 +52,10 @@ def _chosen(clearance: Tensor, distance: Tensor) -> dict[str, int]:
 
 
 def _episode(game: Game, played: Trajectory, label: Extremal, row: int) -> dict[str, Any]:
-    stride = math.ceil(len(played.t) / FRAMES)
-    t, x, theta = played.t[::stride], played.x[row, ::stride], label.theta[row].to(played.x)
+    theta = label.theta[row].to(played.x)
+    closest = int(separation(game.positions(played.x[row])).amin(-1).nan_to_num(math.inf).argmin())
+    frames = sorted({*range(0, len(played.t), math.ceil(len(played.t) / FRAMES)), closest})
+    t, x = played.t[frames], played.x[row, frames]
     places = game.positions(x)
     radius = game.constraint(x, theta.expand(len(t), -1)).amax(-1) + separation(places).amin(-1)
     return {

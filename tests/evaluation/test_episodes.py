@@ -9,6 +9,7 @@ from torch import Tensor
 from hno.evaluation.closed_loop import play
 from hno.evaluation.episodes import FRAMES, episodes
 from hno.games import make
+from hno.games.kinematics import separation
 from hno.types import Extremal
 from tests.fakes import fake_labels
 from tests.walkers import Walkers
@@ -54,7 +55,9 @@ def test_an_episode_shows_where_players_go_and_where_the_equilibrium_goes(sets: 
     played = play(game, straight, sets, 0.02)
     episode = episodes(game, played, sets, 0.02)["episodes"][0]
     frames = len(episode["t"])
-    assert FRAMES / 2 < frames <= FRAMES + 1
+    assert FRAMES / 2 < frames <= FRAMES + 2
+    kept = separation(torch.tensor(episode["positions"])).amin(-1)
+    assert float(kept.min()) == pytest.approx(float(separation(game.positions(played[0].x[3])).min()), abs=2e-3)
     assert (episode["t"][0], episode["t"][-1]) == (0.0, pytest.approx(game.horizon))
     for name in ("positions", "label_positions"):
         assert torch.tensor(episode[name]).shape == (frames, 2, 2)
