@@ -1,6 +1,6 @@
 """Plays the runs of a sweep where they were not trained: other boxes, types, noise, delay.
 
-    python benchmarks/suites.py multirun/<date>/<time> [--suites "half types" "2 x box" noise] [--games lane_change]
+    python benchmarks/suites.py multirun/<date>/<time> [--suites "half types" "2 x box" noise] [--only "sno, sin"]
 
 Suites are in recipe_sets.py; all count starts whose equilibrium keeps 2 cm. What was played before is kept as
 `suites.json` in each run's folder. Prints a table per game, one line for every operator and activation, with counts
@@ -38,6 +38,7 @@ def main() -> None:
     parser.add_argument("sweep", type=Path)
     parser.add_argument("--suites", nargs="+", default=["half types", "2 x box"], choices=sorted(SUITES))
     parser.add_argument("--games", nargs="+")
+    parser.add_argument("--only", nargs="+", help='recipes, such as "sno, sin"')
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     console, everything = Console(width=60 + 50 * len(arguments.suites)), {}
@@ -47,6 +48,8 @@ def main() -> None:
         cases: Cases = {}
         table = Table("recipe", "seeds", *arguments.suites, title=game)
         for name, folders in recipes.items():
+            if arguments.only and name not in arguments.only:
+                continue
             rows = [{"suites": evaluate(folder, game, arguments.suites, cases)} for folder in folders]
             found = {suite: pooled(rows, suite) for suite in arguments.suites}
             table.add_row(name, str(len(rows)), *map(cell, found.values()))
