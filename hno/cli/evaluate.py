@@ -75,7 +75,7 @@ def _run(config: DictConfig, results: Results) -> None:
     paths = checkpoints_of(config)
     policies = [OperatorPolicy(load_operator(path, config.expected_game)) for path in paths]
     game = policies[0].game
-    results.update(**policies[0].operator.names())
+    results.update(**policies[0].operator.names(), seed=policies[0].operator.seed)
     check_same_game(paths, [policy.game for policy in policies])
     check_evaluation(game, config)
     chosen = [types_to_evaluate(config.theta, policy, config.unseen) for policy in policies]
@@ -89,7 +89,8 @@ def _run(config: DictConfig, results: Results) -> None:
         found = assess(policy, labels, config, results) if models else evaluate_policy(policy, labels, config, results)
         outcomes.append(found.collided)
         table = [row._asdict() for row in found.table]
-        models.append({"checkpoint": path, **policy.operator.names(), "table": table})
+        names = {**policy.operator.names(), "seed": policy.operator.seed}
+        models.append({"checkpoint": path, **names, "table": table})
         for name, content in run_sections(policy, labels, config, results):
             models[-1][name] = content
             results.update(**models[0])

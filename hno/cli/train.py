@@ -105,7 +105,7 @@ def fit(config: DictConfig, folder: Path, results: Results) -> L.Trainer:
     if config.trainer.compile and config.trainer.max_steps >= LONG:
         operator.compile_kernels()
     data = build_data(config, operator, label_progress())
-    operator.seen_types, operator.config_hash = data.type_list, config_hash(config)
+    operator.seen_types, operator.config_hash, operator.seed = data.type_list, config_hash(config), config.seed
     check_validation(data.game, config.validation)
     every, stop = config.trainer.validate_every, config.validation.stop_when_safe
     validation = ClosedLoopValidation(folder, every, dt=config.evaluation.dt, stop=stop)

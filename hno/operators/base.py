@@ -87,6 +87,7 @@ class ValueOperator(L.LightningModule, abc.ABC):
         self.exact_terminal = exact_terminal
         self.seen_types: list[tuple[float, ...]] = []
         self.config_hash = ""
+        self.seed: int | None = None
         self.game = game
         self.optimizer = optimizer
         self.norm, self.scaled = Norm(norm), scaled
@@ -257,6 +258,7 @@ class ValueOperator(L.LightningModule, abc.ABC):
             "options": self.options,
             "seen_types": self.seen_types,
             "config_hash": self.config_hash,
+            "seed": self.seed,
         }
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:

@@ -87,6 +87,7 @@ def load_operator(path: str | Path, game: str | None = None) -> ValueOperator:
     except (RuntimeError, TypeError) as error:
         raise CheckpointError(f"{path} does not hold the weights that its own entry {SPEC_KEY!r} describes.") from error
     operator.seen_types = [tuple(theta) for theta in spec["seen_types"]]
+    operator.seed = spec.get("seed")
     return operator.eval().requires_grad_(False)
 
 

@@ -30,11 +30,11 @@ class Condition(NamedTuple):
 
 
 Key = tuple[str, str, str, tuple[float, ...], str]
-"""Game, operator, seed or checkpoint, types, kind of kernel."""
+"""Game, operator, training seed, types, kind of kernel."""
 
 
 def condition_table(runs: Sequence[Run]) -> Table:
-    """One line for every game, operator, model number, type and kind of kernel."""
+    """One line for every game, operator, training seed, type and kind of kernel."""
     found: dict[Key, dict[str, Condition]] = defaultdict(dict)
     for run in runs:
         for entry in records(run.content.get("ntk")):

@@ -32,10 +32,10 @@ def test_evaluation_of_a_trained_model_repeats_the_table_of_its_run(command: Com
     results = run.results
     assert results["table"] == trained.results["table"]
     assert results["table"][0]["costate_error"] is not None
-    assert {name: results[name] for name in ("game", "operator", "activation", "status")} == {
-        "game": "narrow_road", "operator": "hno", "activation": "tanh", "status": "finished",
+    assert {name: results[name] for name in ("game", "operator", "activation", "seed", "status")} == {
+        "game": "narrow_road", "operator": "hno", "activation": "sin", "seed": 0, "status": "finished",
     }  # fmt: skip
-    assert "narrow_road / hno / tanh" in run.text
+    assert "narrow_road / hno / sin" in run.text
     assert {path: path.read_bytes() for path in before} == before
 
 
