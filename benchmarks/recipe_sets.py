@@ -105,6 +105,14 @@ RECIPES: dict[str, dict[str, str]] = {
         "rollout": f"{SHORT} operator=hno sampler=rollout",
         "hardest quarter": f"{SHORT} operator=hno loss.hardest=0.25",
     },
+    "drone": {
+        "tanh, 4000": "operator=sno activation=tanh trainer.max_steps=4000",
+        "tanh, 8000": "operator=sno activation=tanh trainer.max_steps=8000",
+        "tanh, 1e-2": "operator=sno activation=tanh optimizer.lr=1e-2",
+        "tanh, 15 types": f"operator=sno activation=tanh data.trajectories=75 data.types={FIFTEEN}",
+        "tanh, 4000, 400 labels a type": "operator=sno activation=tanh trainer.max_steps=4000 data.trajectories=400",
+        "sin, 4000": "operator=sno activation=sin trainer.max_steps=4000",
+    },
     "types": {
         "4 types x 280": f"{SHORT} {CORNERS} data.trajectories=280",
         "7 types x 160": SHORT,
