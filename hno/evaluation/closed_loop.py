@@ -22,7 +22,7 @@ SHARES = (0.05, 0.25, 0.5)
 
 
 class TypeRow(NamedTuple):
-    """One line of the collision table; numbers that do not exist are None."""
+    """One line of the collision table; numbers that do not exist or are not finite are None."""
 
     theta: tuple[float, ...]
     """Player types."""
@@ -149,8 +149,8 @@ def _row(
         median_min_distance=median(played.distance[safe]),
         median_excess_cost=median(excess.sum(-1)[safe]),
         median_label_cost=median(label_cost[safe]),
-        distance_quantiles=tuple(distance.compute().tolist()) if counted else None,
-        median_excess_costs=tuple(float(own.median()) for own in excess[safe].unbind(-1)) if counted else None,
+        distance_quantiles=_finite(distance.compute()),
+        median_excess_costs=_finite(excess[safe].median(0).values) if counted else None,
         saturated=float(saturated.compute()) if counted else None,
         value_error=errors[0],
         costate_error=errors[1],
@@ -192,5 +192,11 @@ def classify(found: Extremal, clearance: float) -> tuple[Tensor, Tensor]:
 
 
 def median(values: Tensor) -> float | None:
-    """The lower median; None without numbers."""
-    return float(values.median()) if len(values) else None
+    """The lower median; None without numbers, or where it is not finite."""
+    found = _finite(values.median().reshape(1))
+    return None if found is None else found[0]
+
+
+def _finite(values: Tensor) -> tuple[float, ...] | None:
+    """Numbers (N,) as they are stored; None if one is not finite."""
+    return tuple(values.tolist()) if bool(values.isfinite().all()) else None

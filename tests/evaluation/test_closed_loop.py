@@ -86,6 +86,22 @@ def test_a_broken_policy_collides_everywhere() -> None:
     assert (row.collisions, row.marginal_collisions, row.rate) == (1, 1, 1.0)
 
 
+def test_medians_that_are_not_finite_do_not_exist() -> None:
+    """Efforts of 1e40 overflow; the distance of walkers who leave each other does not."""
+    found = labelled([0.9, 0.8, 0.7], [0.5] * 3)
+
+    def violent(tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
+        return torch.tensor([[-1e20, 0.0], [0.0, 0.0]]).expand(len(x), 2, 2)
+
+    (row,) = collision_table(Walkers(), violent, [found], seen=[])
+    assert (row.collisions, row.median_excess_cost, row.median_excess_costs) == (0, None, None)
+    assert row.median_label_cost is not None
+    assert row.median_min_distance is not None
+    nothing = torch.full((2, 2), torch.nan)
+    (row,) = collision_table(Walkers(), lambda tau, x, theta: nothing.expand(len(x), 2, 2), [found], seen=[])
+    assert (row.median_min_distance, row.distance_quantiles) == (None, None)
+
+
 def test_a_disturbance_reaches_the_episodes() -> None:
     """Walkers who step aside at once pass each other; who do so half a second late have collided by then."""
     found = labelled([0.0, 0.9], [0.5, 0.5])
