@@ -92,6 +92,8 @@ def test_impossible_types(command: Command, random_checkpoint: Path, theta: str,
     [
         ("starts=0", "starts must be"),
         ("starts=-4", "starts must be"),
+        *((f"{name}=true", f"{name} must be a") for name in ("starts", "seed", "workers", "delay", "noise", "widen")),
+        ("starts=null", "starts must be"),
         ("dt=0", "dt must be"),
         ("dt=5", "divides the horizon"),
         ("clearance=-1", "clearance must be"),
