@@ -88,7 +88,8 @@ def explain(error: Exception) -> str:
 def run_command(config_name: str, task: Callable[[DictConfig], bool]) -> None:
     """Run a task under Hydra, in every job of a multirun, and exit with 1 if one of them failed.
 
-    A multirun ends with a table of its jobs, also when it is interrupted. The last line is the path of the page.
+    A multirun ends with a table of its jobs, also when it is interrupted. The last line is the path of the page, which
+    failed runs have too.
 
     Args:
         config_name: the root configuration.
@@ -117,10 +118,12 @@ def run_command(config_name: str, task: Callable[[DictConfig], bool]) -> None:
     finally:
         if jobs:
             show_jobs(jobs)
+    if not jobs:
+        for folder in folders:
+            if (folder / "results.json").exists():
+                print(pages.write(folder))
     if not all(outcomes):
         sys.exit(1)
-    if not jobs:
-        print(*map(pages.write, folders), sep="\n")
 
 
 def _attempt(task: Callable[[DictConfig], bool], config: DictConfig) -> bool:
