@@ -80,6 +80,9 @@ def explain(error: Exception) -> str:
     if isinstance(cause, (ConfigAttributeError, ConfigKeyError)) and isinstance(cause.parent_node, DictConfig):
         if str(cause.full_key).startswith("game.constants."):
             return f"Constants of a game need a plus sign: write +{cause.full_key}=<value>."
+        if str(cause.full_key).startswith("conditions."):
+            value = "<value>" if str(cause.full_key).count(".") > 1 else "{...}"
+            return f"New conditions and entries of conditions need a plus sign: write +{cause.full_key}={value}."
         known = sorted(str(key) for key in cause.parent_node)
         return f"{cause.full_key} does not exist. " + unknown_name("configuration key", str(cause.key), known)
     return str(error)

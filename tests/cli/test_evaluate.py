@@ -210,6 +210,8 @@ def test_robustness_is_a_section_on_request(command: Command, random_checkpoint:
 def test_impossible_conditions(command: Command, random_checkpoint: Path) -> None:
     arguments = (f"checkpoint={random_checkpoint}", "robustness=true", *FAST)
     refused(command("evaluate", *arguments, "+conditions.delay.noisy=1"), "No condition entry named 'noisy'", "'noise'")
+    refused(command("evaluate", *arguments, "conditions={storm: {drift: 0.1}}"), "write +conditions.storm={...}")
+    refused(command("evaluate", *arguments, "conditions.delay.drift=1"), "write +conditions.delay.drift=<value>")
     refused(command("evaluate", *arguments, "+conditions.gusts.components=[7]"), "places in a player's state, 0 to 3")
 
 
