@@ -100,6 +100,8 @@ def verdict(table: Sequence[Mapping[str, Any]]) -> str:
     if whole.rate is None or whole.worst_theta is None:
         return "No start has a safe equilibrium: there is no collision rate (n/a)."
     total = f"{whole.collisions} collisions in {whole.safe_starts} safe starts ({percent(whole.rate)})"
+    if whole.collisions == 0:
+        return f"{total}."
     return f"{total}; worst {percent(whole.worst_rate)} at ({types(whole.worst_theta)})."
 
 

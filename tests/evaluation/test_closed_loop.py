@@ -222,3 +222,4 @@ def test_verdict_adds_types_and_names_the_worst(nothing_safe: TypeRow) -> None:
     assert (
         verdict([row._asdict() for row in rows]) == "1 collisions in 5 safe starts (20.00 %); worst 50.00 % at (2, 2)."
     )
+    assert verdict([rows[0]._asdict()]) == "0 collisions in 3 safe starts (0.00 %)."
