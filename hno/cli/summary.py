@@ -80,7 +80,7 @@ def _cells(row: Mapping[str, Any]) -> list[str]:
 
 
 def remarks(table: Sequence[Mapping[str, Any]], clearance: float) -> list[str]:
-    """Which types have no rate and why, and which lie outside the game's range."""
+    """Which types have no rate and why, and which lie outside the game's range or that of training."""
     said = [
         f"No rate (n/a) at ({types(row['theta'])}): of {row['starts']} starts none has an equilibrium that keeps "
         f"{100 * clearance:g} cm; {row['unsolved']} unsolved, {row['inevitable']} inevitable, {row['marginal']} "
@@ -91,6 +91,11 @@ def remarks(table: Sequence[Mapping[str, Any]], clearance: float) -> list[str]:
     outside = [f"({types(row['theta'])})" for row in table if row["extrapolated"]]
     if outside:
         said.append(f"Outside the types that the game is made for, results extrapolate: {', '.join(outside)}.")
+    beyond = [f"({types(row['theta'])})" for row in table if row["outside_seen"]]
+    if beyond:
+        said.append(
+            f"{len(beyond)} of {len(table)} types lie outside the box around the trained ones: {', '.join(beyond)}."
+        )
     return said
 
 

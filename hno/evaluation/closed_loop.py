@@ -64,6 +64,8 @@ class TypeRow(NamedTuple):
     """The same of all costates."""
     extrapolated: bool = False
     """Whether the types lie outside the range that the game is made for."""
+    outside_seen: bool = False
+    """Whether they lie outside the smallest box around the types that the operator was trained with, if any."""
 
 
 def collision_table(
@@ -155,7 +157,13 @@ def _row(
         value_error=errors[0],
         costate_error=errors[1],
         extrapolated=not bool(game.type_box.contains(found.theta[0].to(game.type_box.lo))),
+        outside_seen=bool(seen) and not _inside_hull(theta, seen),
     )
+
+
+def _inside_hull(theta: tuple[float, ...], seen: set[tuple[float, ...]]) -> bool:
+    """Whether types lie in the smallest box around others."""
+    return all(min(column) <= t <= max(column) for t, column in zip(theta, zip(*seen, strict=True), strict=True))
 
 
 def collided(played: Trajectory) -> Tensor:
