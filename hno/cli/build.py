@@ -8,6 +8,7 @@ from pathlib import Path
 import lightning as L
 from omegaconf import DictConfig, OmegaConf
 
+from hno.cli.checks import flag, is_number, whole_number
 from hno.cli.logs import StepLines, loggers, progress_bar
 from hno.cli.results import plain
 from hno.data import GameData
@@ -35,27 +36,25 @@ def check_numbers(config: DictConfig) -> None:
     """Raise ValueError for sizes and rates that are not positive, and shares of the run outside [0, 1]."""
     for name in SIZES:
         value = OmegaConf.select(config, name)
-        if value is not None and not (isinstance(value, int) and value > 0):
-            raise ValueError(f"{name} must be a positive whole number; got {value!r}.")
+        if value is not None:
+            whole_number(name, value, 1)
     for name in ("optimizer.lr", "optimizer.final_lr"):
         value = OmegaConf.select(config, name)
-        if not (isinstance(value, (int, float)) and value > 0):
+        if not (is_number(value) and value > 0):
             raise ValueError(f"{name} must be a positive number; got {value!r}.")
     for name in FLAGS:
         value = OmegaConf.select(config, name)
-        if value is not None and not isinstance(value, bool):
-            raise ValueError(f"{name} must be true or false; got {value!r}.")
-    if not (isinstance(config.trainer.polish, int) and config.trainer.polish >= 0):
-        raise ValueError(f"trainer.polish must be a whole number of at least 0; got {config.trainer.polish!r}.")
-    if not (isinstance(config.seed, int) and config.seed >= 0):
-        raise ValueError(f"seed must be a whole number of at least 0; got {config.seed!r}.")
+        if value is not None:
+            flag(name, value)
+    whole_number("trainer.polish", config.trainer.polish, 0)
+    whole_number("seed", config.seed, 0)
     for name, needed in (("data.types", not config.data.files), ("evaluation.types", False)):
         value = OmegaConf.select(config, name)
         if not OmegaConf.is_list(value) or (needed and not value):
             raise ValueError(f"{name} must list player types, such as [[1, 1], [5, 5]]; got {value!r}.")
     for name in ("data.pretrain", "data.widening"):
         value = OmegaConf.select(config, name)
-        if not (isinstance(value, (int, float)) and 0 <= value <= 1):
+        if not (is_number(value) and 0 <= value <= 1):
             raise ValueError(f"{name} is a share of the run and must lie in [0, 1]; got {value!r}.")
 
 

@@ -80,6 +80,9 @@ def explain(error: Exception) -> str:
     if isinstance(cause, (ConfigAttributeError, ConfigKeyError)) and isinstance(cause.parent_node, DictConfig):
         if str(cause.full_key).startswith("game.constants."):
             return f"Constants of a game need a plus sign: write +{cause.full_key}=<value>."
+        if str(cause.full_key).startswith("conditions."):
+            value = "<value>" if str(cause.full_key).count(".") > 1 else "{...}"
+            return f"New conditions and entries of conditions need a plus sign: write +{cause.full_key}={value}."
         known = sorted(str(key) for key in cause.parent_node)
         return f"{cause.full_key} does not exist. " + unknown_name("configuration key", str(cause.key), known)
     return str(error)
@@ -88,7 +91,8 @@ def explain(error: Exception) -> str:
 def run_command(config_name: str, task: Callable[[DictConfig], bool]) -> None:
     """Run a task under Hydra, in every job of a multirun, and exit with 1 if one of them failed.
 
-    A multirun ends with a table of its jobs, also when it is interrupted. The last line is the path of the page.
+    A multirun ends with a table of its jobs, also when it is interrupted. The last line is the path of the page, which
+    failed runs have too.
 
     Args:
         config_name: the root configuration.
@@ -117,10 +121,12 @@ def run_command(config_name: str, task: Callable[[DictConfig], bool]) -> None:
     finally:
         if jobs:
             show_jobs(jobs)
+    if not jobs:
+        for folder in folders:
+            if (folder / "results.json").exists():
+                print(pages.write(folder))
     if not all(outcomes):
         sys.exit(1)
-    if not jobs:
-        print(*map(pages.write, folders), sep="\n")
 
 
 def _attempt(task: Callable[[DictConfig], bool], config: DictConfig) -> bool:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,6 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from hno.cli.build import cache_folder
+from hno.cli.checks import finite_number, flag, whole_number
 from hno.cli.config import run_command
 from hno.cli.logs import send_lightning_to_hydra
 from hno.cli.results import Results, config_hash, plain, write_json
@@ -193,16 +193,13 @@ def draw(policy: OperatorPolicy, found: Extremal, path: Path, dt: float, episode
 
 def check_evaluation(game: Game, settings: DictConfig) -> None:
     """Raise ValueError for entries that make no evaluation of the game."""
-    for name, least in (("starts", 1), ("seed", 0), ("workers", 1), ("delay", 0)):
-        value = settings.get(name)
-        if value is not None and not (isinstance(value, int) and value >= least):
-            raise ValueError(f"{name} must be a whole number of at least {least}; got {value!r}.")
+    for name, least in (("starts", 1), ("seed", 0), ("delay", 0)):
+        whole_number(name, settings[name], least)
+    if settings.get("workers") is not None:
+        whole_number("workers", settings.workers, 1)
     for name in ("clearance", "dt", "noise", "widen"):
-        value = settings[name]
-        if not (isinstance(value, (int, float)) and math.isfinite(value) and value >= 0):
-            raise ValueError(f"{name} must be a finite number of at least 0; got {value!r}.")
+        finite_number(name, settings[name])
     if settings.widen == 0:
         raise ValueError("widen must be a positive number; got 0.")
-    if not isinstance(settings.safe, bool):
-        raise ValueError(f"safe must be true or false; got {settings.safe!r}.")
+    flag("safe", settings.safe)
     control_steps(game, settings.dt)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ log = logging.getLogger(__name__)
 
 
 def publish(loggers: Sequence[Logger], results: Mapping[str, Any], folder: Path, step: int) -> None:
-    """Send what came of a run to its loggers. One that refuses costs a warning, not the run.
+    """Send what came of a run to its loggers. One that refuses, or a failed picture, costs a warning, not the run.
 
     Args:
         loggers: all of them get the numbers; W&B pictures, an animation and the table too; TensorBoard pictures.
@@ -82,15 +83,21 @@ def draw(results: Mapping[str, Any], folder: Path, kinds: Collection[type[Logger
             collision_map(results["table"], made["collision_map"], title)
     except (PlotsMissingError, OSError, ValueError) as error:
         log.info("No picture for dashboards: %s", error)
+    except Exception as error:
+        log.warning("A picture for dashboards could not be drawn: %s: %s", type(error).__name__, error)
     return {name: path for name, path in made.items() if path.exists()}
 
 
 def worst_episode(results: Mapping[str, Any], folder: Path) -> dict[str, Any] | None:
-    """The stored episode of the smallest clearance; None if the run stored none."""
+    """The stored episode of the smallest clearance, above all one that is not finite; None if the run stored none."""
     if not results.get("episodes"):
         return None
     episodes = json.loads((folder / results["episodes"]).read_text())["episodes"]
-    return min(episodes, key=lambda episode: episode["clearance"], default=None)
+    return min(episodes, key=_clearance, default=None)
+
+
+def _clearance(episode: Mapping[str, Any]) -> float:
+    return -math.inf if episode["clearance"] is None else float(episode["clearance"])
 
 
 def _send_to_wandb(logger: WandbLogger, results: Mapping[str, Any], pictures: Mapping[str, Path], step: int) -> None:

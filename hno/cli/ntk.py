@@ -8,6 +8,7 @@ from typing import Any
 from omegaconf import DictConfig
 from rich.table import Table
 
+from hno.cli.checks import whole_number
 from hno.data.rows import NoLabelsError
 from hno.evaluation.ntk import rows_per_point, type_kernel
 from hno.evaluation.spectrum import Summary, summary
@@ -21,9 +22,7 @@ KINDS = {"kernel": "J J'", "product": "paper's product"}
 
 def check_ntk(operator: ValueOperator, types: Iterable[tuple[float, ...]], settings: DictConfig) -> None:
     """Raise ValueError for entries from which no kernel can be made."""
-    least, rows = rows_per_point(operator), settings.ntk_rows
-    if not (isinstance(rows, int) and rows >= least):
-        raise ValueError(f"ntk_rows must be a whole number of at least {least}, the rows of one point; got {rows!r}.")
+    whole_number("ntk_rows", settings.ntk_rows, rows_per_point(operator), "the rows of one point")
     if not set(types) & set(operator.seen_types):
         seen = "; ".join(",".join(f"{t:g}" for t in theta) for theta in operator.seen_types) or "none"
         raise ValueError(f'ntk=true needs a type of the training run among theta; these are "{seen}".')

@@ -10,6 +10,7 @@ from omegaconf import DictConfig
 from rich.console import Console
 from rich.table import Table
 
+from hno.cli.checks import whole_number
 from hno.cli.tables import interval, number, percent, types
 from hno.evaluation.receding_horizon import RecedingHorizon
 from hno.evaluation.rollout import Disturbance
@@ -52,9 +53,7 @@ def _plain(value: Any) -> Any:
 def check_online(settings: DictConfig) -> None:
     """Raise ValueError for numbers of starts or steps that are none."""
     for name, least in (("online", 0), ("online_interval", 1)):
-        value = settings[name]
-        if isinstance(value, bool) or not (isinstance(value, int) and value >= least):
-            raise ValueError(f"{name} must be a whole number of at least {least}; got {value!r}.")
+        whole_number(name, settings[name], least)
 
 
 def show_online(section: Mapping[str, Any], console: Console) -> None:

@@ -10,6 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
 from hno.cli.build import cache_folder
+from hno.cli.checks import flag
 from hno.cli.ntk import check_ntk, ntk_section, ntk_table
 from hno.cli.online import check_online, online_section, show_online
 from hno.cli.results import Results
@@ -77,8 +78,7 @@ SECTIONS: dict[str, Section] = {
 def check_sections(policy: OperatorPolicy, types: Types, settings: DictConfig) -> None:
     """Raise ValueError for entries that make no sections."""
     for name in ("residuals", "robustness", "ntk"):
-        if not isinstance(settings[name], bool):
-            raise ValueError(f"{name} must be true or false; got {settings[name]!r}.")
+        flag(name, settings[name])
     check_online(settings)
     for name, section in SECTIONS.items():
         if settings[name]:

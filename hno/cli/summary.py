@@ -80,7 +80,7 @@ def _cells(row: Mapping[str, Any]) -> list[str]:
 
 
 def remarks(table: Sequence[Mapping[str, Any]], clearance: float) -> list[str]:
-    """Which types have no rate and why, and which lie outside the game's range."""
+    """Which types have no rate and why, and which lie outside the game's range or that of training."""
     said = [
         f"No rate (n/a) at ({types(row['theta'])}): of {row['starts']} starts none has an equilibrium that keeps "
         f"{100 * clearance:g} cm; {row['unsolved']} unsolved, {row['inevitable']} inevitable, {row['marginal']} "
@@ -91,6 +91,11 @@ def remarks(table: Sequence[Mapping[str, Any]], clearance: float) -> list[str]:
     outside = [f"({types(row['theta'])})" for row in table if row["extrapolated"]]
     if outside:
         said.append(f"Outside the types that the game is made for, results extrapolate: {', '.join(outside)}.")
+    beyond = [f"({types(row['theta'])})" for row in table if row["outside_seen"]]
+    if beyond:
+        said.append(
+            f"{len(beyond)} of {len(table)} types lie outside the box around the trained ones: {', '.join(beyond)}."
+        )
     return said
 
 
@@ -100,6 +105,8 @@ def verdict(table: Sequence[Mapping[str, Any]]) -> str:
     if whole.rate is None or whole.worst_theta is None:
         return "No start has a safe equilibrium: there is no collision rate (n/a)."
     total = f"{whole.collisions} collisions in {whole.safe_starts} safe starts ({percent(whole.rate)})"
+    if whole.collisions == 0:
+        return f"{total}."
     return f"{total}; worst {percent(whole.worst_rate)} at ({types(whole.worst_theta)})."
 
 

@@ -87,6 +87,8 @@ def _worst(counts: Sequence[Row]) -> str:
     counted = [row for row in counts if row["safe_starts"]]
     if not counted:
         return "n/a"
+    if not any(row["collisions"] for row in counted):
+        return "none"
     worst = max(counted, key=lambda row: row["collisions"] / row["safe_starts"])
     return f"{worst['collisions']} of {worst['safe_starts']} at ({types(worst['theta'])})"
 

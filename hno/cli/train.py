@@ -15,6 +15,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from hno.cli.build import build_data, build_game, build_operator, build_trainer, cache_folder, check_numbers
+from hno.cli.checks import whole_number
 from hno.cli.config import run_command
 from hno.cli.evaluate import check_evaluation, evaluate_policy, solve_tests
 from hno.cli.logs import finish_wandb, label_progress, send_lightning_to_hydra
@@ -176,5 +177,4 @@ def check_validation(game: Game, choice: DictConfig) -> None:
     """Raise ValueError for entries that make no validation of the game."""
     if choice.types is not None:
         parse_types(game, choice.types)
-    if choice.types is not None and not (isinstance(choice.starts, int) and choice.starts > 0):
-        raise ValueError(f"validation.starts must be a positive whole number; got {choice.starts!r}.")
+        whole_number("validation.starts", choice.starts, 1)

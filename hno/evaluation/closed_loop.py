@@ -22,7 +22,7 @@ SHARES = (0.05, 0.25, 0.5)
 
 
 class TypeRow(NamedTuple):
-    """One line of the collision table; numbers that do not exist are None."""
+    """One line of the collision table; numbers that do not exist or are not finite are None."""
 
     theta: tuple[float, ...]
     """Player types."""
@@ -64,6 +64,8 @@ class TypeRow(NamedTuple):
     """The same of all costates."""
     extrapolated: bool = False
     """Whether the types lie outside the range that the game is made for."""
+    outside_seen: bool = False
+    """Whether they lie outside the smallest box around the types that the operator was trained with, if any."""
 
 
 def collision_table(
@@ -149,13 +151,19 @@ def _row(
         median_min_distance=median(played.distance[safe]),
         median_excess_cost=median(excess.sum(-1)[safe]),
         median_label_cost=median(label_cost[safe]),
-        distance_quantiles=tuple(distance.compute().tolist()) if counted else None,
-        median_excess_costs=tuple(float(own.median()) for own in excess[safe].unbind(-1)) if counted else None,
+        distance_quantiles=_finite(distance.compute()),
+        median_excess_costs=_finite(excess[safe].median(0).values) if counted else None,
         saturated=float(saturated.compute()) if counted else None,
         value_error=errors[0],
         costate_error=errors[1],
         extrapolated=not bool(game.type_box.contains(found.theta[0].to(game.type_box.lo))),
+        outside_seen=bool(seen) and not _inside_hull(theta, seen),
     )
+
+
+def _inside_hull(theta: tuple[float, ...], seen: set[tuple[float, ...]]) -> bool:
+    """Whether types lie in the smallest box around others."""
+    return all(min(column) <= t <= max(column) for t, column in zip(theta, zip(*seen, strict=True), strict=True))
 
 
 def collided(played: Trajectory) -> Tensor:
@@ -192,5 +200,11 @@ def classify(found: Extremal, clearance: float) -> tuple[Tensor, Tensor]:
 
 
 def median(values: Tensor) -> float | None:
-    """The lower median; None without numbers."""
-    return float(values.median()) if len(values) else None
+    """The lower median; None without numbers, or where it is not finite."""
+    found = _finite(values.median().reshape(1))
+    return None if found is None else found[0]
+
+
+def _finite(values: Tensor) -> tuple[float, ...] | None:
+    """Numbers (N,) as they are stored; None if one is not finite."""
+    return tuple(values.tolist()) if bool(values.isfinite().all()) else None

@@ -29,7 +29,7 @@ class Condition(NamedTuple):
 
 
 class ConditionRow(NamedTuple):
-    """One line of the robustness table, over all types; numbers that do not exist are None."""
+    """One line of the robustness table, over all types; numbers that do not exist or are not finite are None."""
 
     name: str
     """Of the condition."""

@@ -33,6 +33,9 @@ def rollout(
 ) -> Trajectory:
     """Play the game from every start.
 
+    The policy is never asked about states that are not finite: such a row has no controls (NaN) from then on, hence no
+    clearance, and its place in the batch holds its start state.
+
     Args:
         game: the game.
         policy: feedback controls of all players.
@@ -55,7 +58,8 @@ def rollout(
     path, controls, answers = [x], list[Tensor](), list[Tensor]()
     for k in range(steps):
         tau = torch.full_like(theta[:, 0], game.horizon - k * dt)
-        answers.append(play(tau, x, theta))
+        finite = x.isfinite().all(-1).all(-1)[:, None, None]
+        answers.append(play(tau, torch.where(finite, x, x0), theta).where(finite, torch.nan))
         u = answers[max(0, k - disturbance.delay)]
         if noise is not None:
             u = game.control_box.clamp(u + noise[:, k])

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from hno.evaluation.closed_loop import classify
+from hno.evaluation.closed_loop import classify, median
 from hno.evaluation.metrics import clopper_pearson
 from hno.evaluation.receding_horizon import RecedingHorizon
 from hno.evaluation.rollout import Disturbance, Policy, rollout
@@ -135,7 +135,7 @@ def driven(played: Trajectory, label_cost: Tensor, rows: Tensor) -> Driven:
         collisions=collisions,
         rate=collisions / len(rows) if some else None,
         interval=clopper_pearson(collisions, len(rows)),
-        median_excess_cost=float(excess.median()) if some else None,
+        median_excess_cost=median(excess),
         largest_excess_cost=float(excess.max()) if some else None,
     )
 

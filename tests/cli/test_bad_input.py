@@ -106,6 +106,7 @@ def test_types_inside_the_range_warn_of_nothing(command: Command) -> None:
         ("loss.norm=l7", "huber, l1, l2"),
         ("data.interior_types=ring", "'labelled' or 'box'"),
         ("seed=-1", "seed must be"),
+        *((f"{name}=true", name) for name in ("seed", "trainer.max_steps", "optimizer.lr", "data.pretrain")),
     ],
 )  # fmt: skip
 def test_impossible_numbers(command: Command, override: str, message: str) -> None:

@@ -118,9 +118,15 @@ def test_validation_starts_of_chosen_types(command: Command, monkeypatch: pytest
         (("validation.types=''",), "theta must be one of"),
         (("validation.types=5",), "2 finite numbers, one per player; got [5.0]"),
         (("validation.types=[[1,1]]",), "or a list such as '1,1;2.5,4'; got [[1, 1]]"),
-        (("validation.types=grid5", "validation.starts=0"), "validation.starts must be a positive whole number; got 0"),
-        (("validation=grid5", "validation.starts=-2"), "validation.starts must be a positive whole number; got -2"),
-        (("validation=grid5", "validation.starts=many"), "validation.starts must be a positive whole number"),
+        (
+            ("validation.types=grid5", "validation.starts=0"),
+            "validation.starts must be a whole number of at least 1; got 0",
+        ),
+        (
+            ("validation=grid5", "validation.starts=-2"),
+            "validation.starts must be a whole number of at least 1; got -2",
+        ),
+        (("validation=grid5", "validation.starts=many"), "validation.starts must be a whole number of at least 1"),
         (("validation=grid7",), "Did you mean 'grid5'?"),
         (("validation.stop=true",), "Known: seed, starts, stop_when_safe, types"),
         (("loss.hardest=0",), "loss.hardest is a share in (0, 1]; got 0"),

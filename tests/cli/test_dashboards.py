@@ -109,6 +109,27 @@ def test_a_logger_that_refuses_costs_a_warning_not_the_run(tmp_path: Path, caplo
     assert float(last_row(tmp_path)["collision_rate/1,1"]) == 0.1
 
 
+def test_the_worst_episode_is_one_that_is_not_finite(tmp_path: Path) -> None:
+    kept = [{"clearance": clearance} for clearance in (0.3, None, -0.2)]
+    (tmp_path / "episodes.json").write_text(json.dumps({"episodes": kept}))
+    assert media.worst_episode({"episodes": "episodes.json"}, tmp_path) == {"clearance": None}
+
+
+def test_a_picture_that_fails_costs_a_warning_not_the_run(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*arguments: object) -> None:
+        raise TypeError("no such colour")
+
+    monkeypatch.setattr(media, "collision_map", broken)
+    board = TensorBoardLogger(tmp_path, name="", version="tensorboard")
+    publish([board], results(type_row((1, 1), 0, 10)), tmp_path, 1)
+    assert [(r.levelno, "TypeError: no such colour" in r.getMessage()) for r in caplog.records] == [
+        (logging.WARNING, True)
+    ]
+    assert events(tmp_path).Scalars("collision_rate/1,1")[0].value == 0
+
+
 def test_games_of_three_get_no_map_and_the_reason(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.INFO):
         board = TensorBoardLogger(tmp_path, name="", version="tensorboard")

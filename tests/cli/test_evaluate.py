@@ -92,6 +92,8 @@ def test_impossible_types(command: Command, random_checkpoint: Path, theta: str,
     [
         ("starts=0", "starts must be"),
         ("starts=-4", "starts must be"),
+        *((f"{name}=true", f"{name} must be a") for name in ("starts", "seed", "workers", "delay", "noise", "widen")),
+        ("starts=null", "starts must be"),
         ("dt=0", "dt must be"),
         ("dt=5", "divides the horizon"),
         ("clearance=-1", "clearance must be"),
@@ -208,6 +210,8 @@ def test_robustness_is_a_section_on_request(command: Command, random_checkpoint:
 def test_impossible_conditions(command: Command, random_checkpoint: Path) -> None:
     arguments = (f"checkpoint={random_checkpoint}", "robustness=true", *FAST)
     refused(command("evaluate", *arguments, "+conditions.delay.noisy=1"), "No condition entry named 'noisy'", "'noise'")
+    refused(command("evaluate", *arguments, "conditions={storm: {drift: 0.1}}"), "write +conditions.storm={...}")
+    refused(command("evaluate", *arguments, "conditions.delay.drift=1"), "write +conditions.delay.drift=<value>")
     refused(command("evaluate", *arguments, "+conditions.gusts.components=[7]"), "places in a player's state, 0 to 3")
 
 

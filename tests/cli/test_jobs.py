@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from hno.cli import train
+from hno.cli import pages, train
 from hno.cli.sweep import Job, show_jobs
 from tests.cli.conftest import SMOKE, Command, Outcome
 from tests.report.tables import type_row
@@ -23,6 +23,8 @@ def job(root: Path, number: int, settings: tuple[str, ...] = (), **entries: Any)
     return Job(number, folder, settings)
 
 
+write_page = pages.write
+"""The real one."""
 pytestmark = pytest.mark.usefixtures("no_pages")
 
 
@@ -122,7 +124,15 @@ def test_a_single_run_ends_with_its_page(command: Command) -> None:
     assert f"Page: {run.folder}" in run.text.splitlines()
 
 
-def test_a_failed_run_has_no_page(command: Command) -> None:
-    run = command("train", *SMOKE, "trainer.max_steps=2", "optimizer.lr=inf")
+def test_a_failed_run_has_a_page_with_its_reason(command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pages, "write", write_page)
+    run = command("train", *SMOKE, "trainer.max_steps=0")
+    assert run.code == 1
+    assert f"Page: {run.folder / pages.PAGE}" in run.text.splitlines()
+    assert "trainer.max_steps must be a whole number" in (run.folder / pages.PAGE).read_text()
+
+
+def test_without_results_there_is_no_page(command: Command) -> None:
+    run = command("evaluate")
     assert run.code == 1
     assert "Page:" not in run.text

@@ -86,6 +86,22 @@ def test_a_broken_policy_collides_everywhere() -> None:
     assert (row.collisions, row.marginal_collisions, row.rate) == (1, 1, 1.0)
 
 
+def test_medians_that_are_not_finite_do_not_exist() -> None:
+    """Efforts of 1e40 overflow; the distance of walkers who leave each other does not."""
+    found = labelled([0.9, 0.8, 0.7], [0.5] * 3)
+
+    def violent(tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
+        return torch.tensor([[-1e20, 0.0], [0.0, 0.0]]).expand(len(x), 2, 2)
+
+    (row,) = collision_table(Walkers(), violent, [found], seen=[])
+    assert (row.collisions, row.median_excess_cost, row.median_excess_costs) == (0, None, None)
+    assert row.median_label_cost is not None
+    assert row.median_min_distance is not None
+    nothing = torch.full((2, 2), torch.nan)
+    (row,) = collision_table(Walkers(), lambda tau, x, theta: nothing.expand(len(x), 2, 2), [found], seen=[])
+    assert (row.median_min_distance, row.distance_quantiles) == (None, None)
+
+
 def test_a_disturbance_reaches_the_episodes() -> None:
     """Walkers who step aside at once pass each other; who do so half a second late have collided by then."""
     found = labelled([0.0, 0.9], [0.5, 0.5])
@@ -170,6 +186,15 @@ def test_types_outside_the_range_of_the_game_are_marked() -> None:
     ]
 
 
+def test_types_outside_the_box_around_the_trained_ones_are_marked() -> None:
+    sets = [labelled([0.9], [0.5], theta=theta) for theta in (1.0, 1.5, 3.0, 4.0)]
+    rows = collision_table(Walkers(), straight, sets, seen=[(1.0, 3.0), (3.0, 1.0)])
+    assert [row.outside_seen for row in rows] == [False, False, False, True]
+    assert remarks([row._asdict() for row in rows], 0.02) == [
+        "1 of 4 types lie outside the box around the trained ones: (4, 4)."
+    ]
+
+
 @pytest.fixture
 def nothing_safe() -> TypeRow:
     found = labelled([0.9, 0.9, 0.9], [-0.5, 0.01, 0.5], [GOOD, GOOD, BAD])
@@ -206,3 +231,4 @@ def test_verdict_adds_types_and_names_the_worst(nothing_safe: TypeRow) -> None:
     assert (
         verdict([row._asdict() for row in rows]) == "1 collisions in 5 safe starts (20.00 %); worst 50.00 % at (2, 2)."
     )
+    assert verdict([rows[0]._asdict()]) == "0 collisions in 3 safe starts (0.00 %)."

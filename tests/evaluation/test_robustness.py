@@ -6,8 +6,10 @@ from collections.abc import Sequence
 
 import pytest
 import torch
+from rich.console import Console
 from torch import Tensor
 
+from hno.cli.tables import show_robustness
 from hno.evaluation.closed_loop import collision_table
 from hno.evaluation.robustness import Condition, read_conditions, robustness_table
 from hno.evaluation.rollout import Disturbance
@@ -100,3 +102,11 @@ def test_entries_replace_those_of_the_table() -> None:
 def test_impossible_conditions(content: object, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         read_conditions(make("narrow_road"), content, Condition("base"))
+
+
+def test_without_a_collision_no_type_is_the_worst(capsys: pytest.CaptureFixture[str]) -> None:
+    for heights, worst in (([0.9, 0.8], "none"), ([0.9, 0.05], "1 of 2 at (1, 1)")):
+        labels = [labelled(heights)]
+        rows = robustness_table(Walkers(), straight, [Condition("all")], lambda _, labels=labels: labels, 0.02, 0.1)
+        show_robustness([row._asdict() for row in rows], Console(width=140))
+        assert worst in capsys.readouterr().out

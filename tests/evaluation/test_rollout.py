@@ -271,3 +271,21 @@ def test_a_broken_policy_is_not_safe_under_noise() -> None:
     broken = steady(game, torch.full((2, 2), torch.nan))
     played = rollout(game, broken, x0, torch.ones(1, 2), disturbance=Disturbance(0.1, 1))
     assert not bool(played.clearance > 0)
+
+
+def test_policies_are_asked_about_finite_states_alone() -> None:
+    """An episode that floating point cannot hold is a collision; the others go on as without it."""
+    game, x0, theta = Walkers(), torch.tensor([[[0.0, 0.9], [0.0, 0.9]]]).repeat(2, 1, 1), torch.ones(2, 2)
+
+    def strict(tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
+        assert x.isfinite().all()
+        u = torch.tensor([4.0, 0.0]).repeat(len(x), 2, 1)
+        u[1:, 0, 0] = 3e38
+        return u
+
+    played, alone = rollout(game, strict, x0, theta, 0.1), rollout(game, strict, x0[:1], theta[:1], 0.1)
+    assert (played.clearance > 0).tolist() == [True, False]
+    assert torch.equal(played.x[:1], alone.x)
+    assert torch.equal(played.value[:1], alone.value)
+    pushed = rollout(game, strict, x0, theta, 0.1, disturbance=Disturbance(drift=1e38, belief=0.5))
+    assert pushed.u[:, -1].isnan().all()
