@@ -75,3 +75,14 @@ def test_ratios_of_condition_numbers_are_bounds_where_a_kernel_is_cut_off(tmp_pa
     assert cells["kernel"] == "J J'"
     assert cells.get("tanh / sin", "n/a") == ratio
     assert cells["tanh / relu"] != "n/a"
+
+
+def test_kernels_of_different_points_or_runs_are_lines_of_their_own(tmp_path):
+    kernels = [("0", "tanh", 600.0, 4), ("1", "sin", 200.0, 40), ("2", "sin", 300.0, 4), ("3", "sin", 100.0, 4)]
+    for name, activation, condition, points in kernels:
+        section = [{"theta": [1.0, 1.0], "points": points, "kernel": kernel(condition), "product": None}]
+        write_run(tmp_path / name, results(activation, ntk=section), extras=False)
+    table = condition_table(load(tmp_path).runs)
+    lines = [dict(zip(table.columns, (cell.text for cell in line.cells), strict=True)) for line in table.rows]
+    shown = [[line[name] for name in ("points", "run", "tanh", "sin", "tanh / sin")] for line in lines]
+    assert shown == [["4", "2", "600", "300", "2"], ["4", "3", "600", "100", "6"], ["40", "", "n/a", "200", "n/a"]]
