@@ -38,7 +38,7 @@ Line = tuple[str, Mapping[str, Summary]]
 def condition_table(runs: Sequence[Run]) -> Table:
     """One line for every game, operator, training seed, type, size and kind of kernel.
 
-    Where several runs share all of that and the activation, each has a line of its own, beside the activations of one run.
+    Where several runs share all of that and the activation, each has a line of its own, beside activations of one run.
     """
     found: dict[Key, dict[str, list[tuple[str, Summary]]]] = defaultdict(lambda: defaultdict(list))
     for run in runs:

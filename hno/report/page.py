@@ -150,8 +150,8 @@ def _gradient(palette: Palette) -> str:
 def _games(found: Sequence[Recipe]) -> list[dict[str, Any]]:
     """One card of the summary for every game."""
     chosen: dict[str, list[Recipe]] = {}
-    for (game, _), recipe in best(found).items():
-        chosen.setdefault(game, []).append(recipe)
+    for recipe in best(found).values():
+        chosen.setdefault(recipe.game, []).append(recipe)
     sentences: dict[str, list[str]] = {}
     for game, _, text in words.verdicts(found):
         sentences.setdefault(game, []).append(text)

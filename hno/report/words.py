@@ -101,10 +101,10 @@ def quality(found: Rate) -> str:
 
 def verdicts(recipes: Sequence[Recipe]) -> list[tuple[str, Recipe, str]]:
     """Game, its best recipe and a judgement of it, for every game and conditions of play."""
-    return [(game, one, _verdict(one, conditions, recipes)) for (game, conditions), one in best(recipes).items()]
+    return [(one.game, one, _verdict(one, recipes)) for one in best(recipes).values()]
 
 
-def _verdict(recipe: Recipe, conditions: str, recipes: Sequence[Recipe]) -> str:
+def _verdict(recipe: Recipe, recipes: Sequence[Recipe]) -> str:
     judged = {"safe": "No start collides", "rare": "Collisions are rare", "unsafe": "Not safe"}[quality(recipe.rate)]
     most = worst(recipe.table)
     at = ""
@@ -113,7 +113,7 @@ def _verdict(recipe: Recipe, conditions: str, recipes: Sequence[Recipe]) -> str:
     others = [other.name for other in rivals(recipe, recipes)]
     rest = f" Not told apart from {_list(others)}: the intervals overlap." if others else ""
     return (
-        f"{judged} ({seeds(recipe)}, {conditions}): 95 % interval {interval(recipe.rate.interval)}.{at} "
+        f"{judged} ({seeds(recipe)}, {recipe.conditions}): 95 % interval {interval(recipe.rate.interval)}.{at} "
         f"Joint cost above the equilibrium's: {over_seeds(recipe.excess)}.{rest}"
     )
 
