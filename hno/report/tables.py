@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from hno.report.aggregate import Recipe, Spread, best, excess, seconds, total, worst
 from hno.report.parsing import number as sound
-from hno.report.parsing import records, whole
+from hno.report.parsing import whole
 from hno.report.runs import ENDED, NOT_AVAILABLE, Run, label_statistics
 from hno.report.words import interval, number, over_seeds, percent, signed, theta
 
@@ -17,15 +17,7 @@ LONGEST = 400
 LISTED = 6
 """Numbers of a list that are shown."""
 ROWS = 200
-"""Rows of an evaluation's table that are kept."""
-SECTIONS = {
-    "robustness": "Robustness",
-    "residuals": "HJI residual by region",
-    "ntk": "Neural tangent kernel",
-    "online": "Online solver as a yardstick",
-    "comparison": "Models side by side",
-}
-"""Further results of evaluate.py, rendered where they are."""
+"""Rows of any list that are kept."""
 
 
 class Cell(NamedTuple):
@@ -45,10 +37,16 @@ class Row(NamedTuple):
 
 
 class Table(NamedTuple):
-    """Columns and rows; `numeric` tells which columns are aligned as numbers."""
+    """Columns and rows."""
 
     columns: list[str]
     rows: list[Row]
+    total: int | None = None
+    """Rows that there are, where some may have been left out."""
+
+    def first(self, count: int) -> Table:
+        """The first rows."""
+        return self._replace(rows=self.rows[:count], total=self.total or len(self.rows))
 
 
 def names_of(entry: Run | Recipe, level: str) -> dict[str, str]:
@@ -133,7 +131,9 @@ def generic(entries: Sequence[Mapping[str, Any]]) -> Table:
     rows = [_flat(entry) for entry in entries[:ROWS]]
     columns = list(dict.fromkeys(key for row in rows for key in row))
     return Table(
-        columns, [Row([value_cell(row[key], key) if key in row else Cell("") for key in columns]) for row in rows]
+        columns,
+        [Row([value_cell(row[key], key) if key in row else Cell("") for key in columns]) for row in rows],
+        len(entries),
     )
 
 
@@ -164,21 +164,6 @@ def value_cell(value: Any, column: str = "") -> Cell:
         return Cell(interval((numbers[0], numbers[1])) if last == "interval" and len(numbers) == 2 else theta(numbers))
     text = value if isinstance(value, str) else json.dumps(value, sort_keys=True)
     return Cell(text if len(text) <= LONGEST else f"{text[:LONGEST]}…")
-
-
-def sections(run: Run) -> dict[str, Table]:
-    """Tables of the further results of a run, by heading."""
-    found: dict[str, Table] = {}
-    for key, heading in SECTIONS.items():
-        content = run.content.get(key)
-        if isinstance(content, dict) and content:
-            lists = {name: entry for name, entry in content.items() if records(entry)}
-            rest = {name: entry for name, entry in content.items() if name not in lists}
-            found |= {heading: generic([rest])} if rest else {}
-            found |= {f"{heading}: {name}": generic(records(entry)) for name, entry in lists.items()}
-        elif records(content):
-            found[heading] = generic(records(content))
-    return found
 
 
 def label_tables(runs: Sequence[Run]) -> list[tuple[str, int, Table]]:
