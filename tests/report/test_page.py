@@ -69,6 +69,10 @@ def test_every_job_is_accounted_for(small_page):
     assert "16 not begun" in text
 
 
+def test_the_excess_cost_is_explained_as_it_is_taken(small_page):
+    assert "Excess cost: median over types of (median joint cost above" in html.unescape(small_page)
+
+
 def test_controls_have_names(small_page):
     page = Page(small_page)
     ids = {attributes.get("id") for _, attributes in page.elements}
