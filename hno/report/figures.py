@@ -94,12 +94,19 @@ def heat_cells(rows: Sequence[TypeResult]) -> list[dict[str, Any]]:
             "theta_1": row.theta[0],
             "theta_2": row.theta[1],
             "shown": rate,
-            "label": "n/a" if rate is None else ("0" if rate == 0 else f"{100 * rate:.{1 if rate < 0.0995 else 0}f}"),
+            "label": _label(rate),
             "seen": row.seen,
         }
         for row in rows
         for rate in [Rate(row.collisions, row.starts).value]
     ]
+
+
+def _label(rate: float | None) -> str:
+    """A rate in %, short enough for a cell."""
+    if not rate:
+        return "n/a" if rate is None else "0"
+    return "<0.1" if rate < 0.0005 else f"{100 * rate:.{1 if rate < 0.0995 else 0}f}"
 
 
 def comparison_figure(found: Sequence[Recipe]) -> alt.TopLevelMixin | None:

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from hno.report.aggregate import recipes
-from hno.report.figures import markdown, summary, write_figures
+from hno.report.figures import heat_cells, markdown, summary, write_figures
 from hno.report.kernels import condition_table
+from hno.report.parsing import TypeResult
 from hno.report.runs import load
 from tests.report.folders import GRID5, make_results, row, write_run
 
@@ -49,6 +50,14 @@ def test_the_summary_repeats_the_counts(tmp_path):
     text = markdown(sweep, found)
     assert "| drone | sno / tanh | 1 | 150 | 3 | 2.00 % |" in text
     assert "3 of 150" in text
+
+
+@pytest.mark.parametrize(
+    ("collisions", "starts", "label"), [(0, 9, "0"), (1, 10_000, "<0.1"), (1, 1000, "0.1"), (1, 2, "50"), (0, 0, "n/a")]
+)
+def test_a_cell_never_rounds_a_collision_away(collisions, starts, label):
+    (cell,) = heat_cells([TypeResult((1.0, 1.0), True, collisions, starts, None, None, None)])
+    assert cell["label"] == label
 
 
 def kernel(condition, rank=8):

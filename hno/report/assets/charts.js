@@ -55,6 +55,8 @@ function drawHeat(host) {
   draw(host, "heat", { cells: rows }, { x_step: step, y_step: step });
 }
 
+const inPercent = (rate) => (rate < 0.0005 ? "<0.1" : (100 * rate).toFixed(rate < 0.0995 ? 1 : 0));
+
 function heatCell(cell, a, b, which, step) {
   const names = { theta_1: a, theta_2: b };
   if (!cell) return { ...names, shown: undefined, label: "", seen: false, tip: `types ${types([a, b])}\nnot evaluated` };
@@ -62,7 +64,7 @@ function heatCell(cell, a, b, which, step) {
   const bounds = DATA.intervals[`${hits}/${starts}`];
   const rate = starts ? hits / starts : null;
   const shown = which === "rate" || !bounds ? rate : bounds[1];
-  const label = shown === null ? "–" : shown === 0 ? "0" : step < 20 ? "" : (100 * shown).toFixed(shown < 0.0995 ? 1 : 0);
+  const label = shown === null ? "–" : shown === 0 ? "0" : step < 20 ? "" : inPercent(shown);
   const tip = [
     `types ${types(theta)}, ${seen ? "seen in training" : "without training labels"}`,
     starts ? `${hits} of ${starts} safe starts collide: ${percent(rate)}` : "no safe start: rate n/a",
