@@ -25,6 +25,8 @@ from hno.report.tables import Table, recipe_table
 WIDE, HIGH = 420, 170
 """Size of a view of an encounter, px."""
 KINDS = ("worst", "typical")
+LEGEND = alt.Legend(title="rate", format=".1%", values=[0.001, 0.01, 0.1, 1], gradientLength=120)
+"""Of the colours of heat maps."""
 
 
 def write_figures(sweep: Sweep, folder: Path) -> list[Path]:
@@ -70,17 +72,22 @@ def collision_figure(found: Sequence[Recipe]) -> alt.ConcatChart | None:
     """One heat map for every recipe of a game, seen types framed; None where there is nothing to show."""
     shown = [recipe for recipe in found if recipe.table and all(len(row.theta) == 2 for row in recipe.table)]
     maps = [
-        charts.heat_map(_inline(heat_cells(recipe.table))).properties(
-            title=alt.TitleParams(
-                recipe.name, subtitle=f"{words.share(recipe.rate)}, {words.seeds(recipe)}", anchor="start"
-            )
+        charts.heat_map(_inline(heat_cells(recipe.table)), LEGEND if k == 0 else None, font=12).properties(
+            title=alt.TitleParams(recipe.name, subtitle=_counts(recipe), anchor="start")
         )
-        for recipe in shown
+        for k, recipe in enumerate(shown)
     ]
     if not maps:
         return None
     title = alt.TitleParams(f"{shown[0].game}: collisions of safe starts in %; framed: types with training labels")
     return alt.concat(*maps, columns=math.isqrt(len(maps) - 1) + 1, spacing=30, title=title)
+
+
+def _counts(recipe: Recipe) -> list[str]:
+    """How many starts and seeds a map is made of, as a whole and type by type."""
+    starts = [row.starts for row in recipe.table]
+    each = f"{min(starts):,}" if min(starts) == max(starts) else f"{min(starts):,} to {max(starts):,}"
+    return [f"{words.share(recipe.rate)}, {words.seeds(recipe)}", f"{each} safe starts per type"]
 
 
 def _inline(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

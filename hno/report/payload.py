@@ -54,6 +54,7 @@ def _compared(recipe: Recipe) -> list[dict[str, Any]]:
     names = {"game": recipe.game, "operator": recipe.operator, "activation": recipe.activation, "recipe": recipe.name}
     low, high = recipe.rate.interval or (None, None)
     pooled = {**names, "seed": None, "rate": recipe.rate.value, "low": low, "high": high}
+    pooled["count"] = f"{recipe.rate.collisions:,} of {recipe.rate.starts:,}"
     pooled["tip"] = f"{recipe.name}, {len(recipe.runs)} seeds\n{rate(recipe.rate)}"
     return [pooled, *({**names, **entry} for entry in map(_seed, recipe.runs))]
 

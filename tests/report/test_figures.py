@@ -52,6 +52,23 @@ def test_the_summary_repeats_the_counts(tmp_path):
     assert "3 of 150" in text
 
 
+def drawn(texts):
+    return [text for text in ET.fromstring(texts).itertext() if text.strip()]
+
+
+def test_figures_show_their_counts(tmp_path):
+    table = [row((1.0, 1.0), 3, 100), row((5.0, 5.0), 0, 50)]
+    for operator in ("hno", "sno"):
+        write_run(tmp_path / operator, results(table=table, operator=operator), extras=False)
+    write_figures(load(tmp_path), tmp_path / "figures")
+    comparison, maps = (
+        drawn((tmp_path / "figures" / f"{name}_drone.svg").read_text()) for name in ("comparison", "collisions")
+    )
+    assert comparison.count("3 of 150") == 2
+    assert maps.count("50 to 100 safe starts per type") == 2
+    assert maps.count("rate") == 1
+
+
 @pytest.mark.parametrize(
     ("collisions", "starts", "label"), [(0, 9, "0"), (1, 10_000, "<0.1"), (1, 1000, "0.1"), (1, 2, "50"), (0, 0, "n/a")]
 )
