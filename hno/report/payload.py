@@ -63,7 +63,7 @@ def _seed(run: Run) -> dict[str, Any]:
     counts = Rate(sum(row.collisions for row in run.table), sum(row.starts for row in run.table))
     low, high = counts.interval or (None, None)
     most = worst(run.table)
-    at = "" if most is None else f"\nworst type {theta(most.theta)}"
+    at = "" if most is None or not most.collisions else f"\nworst type {theta(most.theta)}"
     seed = "n/a" if run.seed is None else run.seed
     return {"seed": seed, "rate": counts.value, "low": low, "high": high, "tip": f"seed {seed}: {rate(counts)}{at}"}
 

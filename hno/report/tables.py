@@ -10,7 +10,7 @@ from hno.report.aggregate import Recipe, Spread, best, excess, seconds, total, w
 from hno.report.parsing import number as sound
 from hno.report.parsing import whole
 from hno.report.runs import ENDED, NOT_AVAILABLE, Run, label_statistics
-from hno.report.words import interval, number, over_seeds, percent, signed, theta
+from hno.report.words import interval, number, over_seeds, percent, signed, theta, worst_type
 
 LONGEST = 400
 """Characters of a cell that are kept."""
@@ -71,14 +71,13 @@ def recipe_table(found: Sequence[Recipe]) -> Table:
 def _recipe(recipe: Recipe) -> list[Cell]:
     counts, rates, most = recipe.rate, recipe.rates, worst(recipe.table)
     across = NOT_AVAILABLE if rates is None else f"{percent(rates.low)} to {percent(rates.high)}"
-    at = NOT_AVAILABLE if most is None else f"{theta(most.theta)} {percent(most.collisions / most.starts)}"
     return [
         Cell(recipe.game), Cell(recipe.name), Cell(str(len(recipe.runs)), len(recipe.runs)),
         Cell(f"{counts.starts:,}", counts.starts), Cell(f"{counts.collisions:,}", counts.collisions),
         Cell(percent(counts.value), counts.value),
         Cell(interval(counts.interval), (counts.interval or (None, None))[1]),
         Cell(across, None if rates is None else rates.high),
-        Cell(at, None if most is None else most.collisions / most.starts),
+        Cell(worst_type(most), None if most is None else most.collisions / most.starts),
         Cell(over_seeds(recipe.excess), None if recipe.excess is None else recipe.excess.mean),
         *(_seconds(recipe.seconds(part)) for part in ("labels", "training", "total")),
         Cell(str(recipe.unfinished), recipe.unfinished), Cell(str(recipe.failed), recipe.failed),
@@ -106,7 +105,6 @@ def _mark(run: Run) -> str:
 
 def _run(run: Run) -> list[Cell]:
     counts, most, above, steps = total(run.table), worst(run.table), excess(run.table), whole(run.content.get("steps"))
-    at = NOT_AVAILABLE if most is None else f"{theta(most.theta)} {percent(most.collisions / most.starts)}"
     metrics = run.content.get("metrics")
     errors = [
         sound(metrics.get(f"val/{name}_error")) if isinstance(metrics, dict) else None for name in ("value", "costate")
@@ -121,7 +119,7 @@ def _run(run: Run) -> list[Cell]:
         Cell(f"{counts.collisions:,}" if played else NOT_AVAILABLE, counts.collisions if played else None),
         Cell(percent(counts.value), counts.value),
         Cell(interval(counts.interval), (counts.interval or (None, None))[1]),
-        Cell(at, None if most is None else most.collisions / most.starts), Cell(signed(above), above),
+        Cell(worst_type(most), None if most is None else most.collisions / most.starts), Cell(signed(above), above),
         *(Cell(number(error, 4), error) for error in errors), Cell(number(spent, 0), spent),
     ]  # fmt: skip
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from hno.report.aggregate import Rate, Recipe, Spread, best, rivals, worst
+from hno.report.parsing import TypeResult
 from hno.report.runs import NOT_AVAILABLE, Run, Sweep
 
 
@@ -54,6 +55,13 @@ def rate(found: Rate) -> str:
 def share(found: Rate) -> str:
     """Collisions of starts, in short."""
     return f"{found.collisions:,} of {found.starts:,}: {percent(found.value)}"
+
+
+def worst_type(found: TypeResult | None) -> str:
+    """The type with the highest rate: "none" where nothing collided, "n/a" without starts."""
+    if found is None:
+        return NOT_AVAILABLE
+    return f"{theta(found.theta)} {percent(found.collisions / found.starts)}" if found.collisions else "none"
 
 
 def clearance(value: float | None) -> str:

@@ -15,6 +15,7 @@ from scipy.stats import beta, t
 from hno.report.aggregate import Rate, Recipe, best, excess, pool, recipes, rivals, spread, worst
 from hno.report.parsing import TypeResult
 from hno.report.runs import Run, load
+from hno.report.words import worst_type
 from tests.report.folders import make_results, row, write_run
 
 FIRST, SECOND = (1.0, 1.0), (5.0, 5.0)
@@ -62,6 +63,12 @@ def test_nothing_is_not_zero():
     assert Rate(0, 0).interval is None
     assert excess([result(FIRST, 0, 0)]) is None
     assert worst([result(FIRST, 0, 0)]) is None
+
+
+def test_where_nothing_collided_no_type_is_the_worst():
+    assert worst_type(worst([result(FIRST, 0, 0)])) == "n/a"
+    assert worst_type(worst([result(FIRST, 0, 9), result(SECOND, 0, 9)])) == "none"
+    assert worst_type(worst([result(FIRST, 0, 9), result(SECOND, 1, 10)])) == "(5, 5) 10.00 %"
 
 
 def test_counts_are_pooled_and_other_numbers_averaged():
