@@ -20,7 +20,7 @@ from hno.report.kernels import condition_table
 from hno.report.palette import LIGHT, chart_config
 from hno.report.parsing import Episode, TypeResult
 from hno.report.runs import Sweep
-from hno.report.tables import Table, recipe_table
+from hno.report.tables import CACHED, Table, recipe_table
 
 WIDE, HIGH = 420, 170
 """Size of a view of an encounter, px."""
@@ -188,7 +188,7 @@ def markdown(sweep: Sweep, found: Sequence[Recipe]) -> str:
     """Verdicts and tables."""
     parts = [f"# {sweep.name}", words.jobs(sweep)]
     parts += [f"- **{game}**, {one.name}, {words.share(one.rate)}. {text}" for game, one, text in words.verdicts(found)]
-    parts += ["## Recipes", table_text(recipe_table(found)), "## Time", table_text(cost_table(found))]
+    parts += ["## Recipes", table_text(recipe_table(found)), "## Time", table_text(cost_table(found)), CACHED]
     kernels = condition_table(sweep.runs)
     parts += ["## Condition numbers of the tangent kernel", table_text(kernels)] if kernels.rows else []
     missing = [f"- {run.name}: {words.why(run)}" for run in sweep.runs if not run.finished]

@@ -18,7 +18,7 @@ from hno.report.charts import library, specifications
 from hno.report.further import fitting, further
 from hno.report.palette import DARK, FONT, LIGHT, Palette, chart_config, signals
 from hno.report.runs import NOT_AVAILABLE, Run, Sweep
-from hno.report.tables import generic, label_tables, names_of, recipe_table, run_table
+from hno.report.tables import CACHED, generic, label_tables, names_of, recipe_table, run_table
 
 LIMIT = 3_000_000
 """Most bytes of a page."""
@@ -96,6 +96,7 @@ def _content(sweep: Sweep, refresh: float | None) -> tuple[dict[str, Any], dict[
         "filters": {name: _choices(sweep.runs, name) for name in ("game", "operator", "activation", "seed")},
         "cards": [card for card in cards if card["id"] in maps],
         "cards_total": len(cards),
+        "cached": CACHED,
         "recipe_table": recipe_table(found),
         "run_table": run_table(sweep.runs),
         "problems": [(run.name, run.status, words.why(run)[:600]) for run in sweep.runs if not run.finished],

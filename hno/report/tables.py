@@ -79,13 +79,23 @@ def _recipe(recipe: Recipe) -> list[Cell]:
         Cell(across, None if rates is None else rates.high),
         Cell(worst_type(most), None if most is None else most.collisions / most.starts),
         Cell(over_seeds(recipe.excess), None if recipe.excess is None else recipe.excess.mean),
-        *(_seconds(recipe.seconds(part)) for part in ("labels", "training", "total")),
+        _cached(recipe.seconds("labels")), *(_seconds(recipe.seconds(part)) for part in ("training", "total")),
         Cell(str(recipe.unfinished), recipe.unfinished), Cell(str(recipe.failed), recipe.failed),
     ]  # fmt: skip
 
 
 def _seconds(found: Spread | None) -> Cell:
     return Cell(NOT_AVAILABLE) if found is None else Cell(number(found.mean, 0), found.mean)
+
+
+CACHED = "Labels that were cached took no time, and the total is then without them."
+
+
+def _cached(found: Spread | None) -> Cell:
+    """Time for labels; no time is said to be the cache's."""
+    if found is None or found.low > 0:
+        return _seconds(found)
+    return Cell("cached" if found.high == 0 else f"{number(found.mean, 0)} (partly cached)", found.mean)
 
 
 RUN_COLUMNS = [

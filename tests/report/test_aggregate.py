@@ -15,6 +15,7 @@ from scipy.stats import beta, t
 from hno.report.aggregate import Rate, Recipe, best, excess, pool, recipes, rivals, spread, worst
 from hno.report.parsing import TypeResult
 from hno.report.runs import Run, load
+from hno.report.tables import recipe_table
 from hno.report.words import worst_type
 from tests.report.folders import make_results, row, write_run
 
@@ -93,6 +94,14 @@ def test_seeds_of_one_recipe_are_one_line(tmp_path):
     assert (recipe.rates.low, recipe.rates.high) == (1 / 200, 7 / 200)
     assert recipe.seconds("labels").mean == 1.5
     assert recipe.variant == ""
+
+
+@pytest.mark.parametrize(("seeds", "shown"), [((0,), "cached"), ((0, 1), "5 (partly cached)"), ((1, 2), "15")])
+def test_labels_from_the_cache_are_said_to_be(tmp_path, seeds, shown):
+    for seed in seeds:
+        write(tmp_path / str(seed), seed, (0, 1), seconds={"labels": 10.0 * seed, "training": 50.0})
+    table = recipe_table(recipes(loaded(tmp_path)))
+    assert table.rows[0].cells[table.columns.index("labels s")].text == shown
 
 
 def test_another_setting_is_another_recipe_and_says_which(tmp_path):
