@@ -242,6 +242,11 @@ def _order(recipe: Recipe) -> tuple[float, float]:
     return recipe.rate.value or 0.0, math.inf if recipe.excess is None else recipe.excess.mean
 
 
+def headline(found: Iterable[Recipe]) -> Recipe:
+    """Of the best recipes of a game the one at its usual constants and conditions, then at the most types."""
+    return min(found, key=lambda one: ("," in one.conditions, -len(one.comparable[2]), *_order(one)))
+
+
 def rivals(chosen: Recipe, found: Iterable[Recipe]) -> list[Recipe]:
     """Recipes that may be compared with the chosen one and whose interval of the collision rate overlaps its own."""
     inside = chosen.rate.interval

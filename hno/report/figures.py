@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from hno.data.store import replace_whole
 from hno.report import charts, payload, words
-from hno.report.aggregate import Rate, Recipe, best, recipes
+from hno.report.aggregate import Rate, Recipe, best, headline, recipes
 from hno.report.kernels import condition_table
 from hno.report.palette import LIGHT, chart_config
 from hno.report.parsing import Episode, TypeResult
@@ -127,7 +127,7 @@ def encounter_figures(found: Sequence[Recipe]) -> dict[str, alt.TopLevelMixin]:
     chosen = [recipe for recipe in best(found).values() if any(run.episodes for run in recipe.runs)]
     if not chosen:
         return {}
-    recipe = min(chosen, key=lambda one: one.rate.value or 0.0)
+    recipe = headline(chosen)
     views: dict[str, alt.TopLevelMixin] = {}
     for kind in KINDS:
         own = [episode for run in recipe.runs for episode in run.episodes if episode.kind == kind]

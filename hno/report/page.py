@@ -13,7 +13,7 @@ from markupsafe import Markup
 
 from hno.data.store import replace_whole
 from hno.report import payload, words
-from hno.report.aggregate import Recipe, best, recipes, total, worst
+from hno.report.aggregate import Recipe, best, headline, recipes, total, worst
 from hno.report.charts import library, specifications
 from hno.report.further import fitting, further
 from hno.report.palette import DARK, FONT, LIGHT, Palette, chart_config, signals
@@ -168,11 +168,11 @@ def _game(game: str, chosen: Sequence[Recipe], sentences: Sequence[str]) -> dict
     if not chosen:
         text = f"Nothing was played: the collision rate is {NOT_AVAILABLE}."
         return {"name": game, "quality": "unknown", "rate": NOT_AVAILABLE, "best": "", "n": "", "sentences": [text]}
-    first = min(chosen, key=lambda recipe: recipe.rate.value or 0.0)
+    first = headline(chosen)
     counts = f"{first.rate.collisions:,} of {first.rate.starts:,}"
     return {
         "name": game, "quality": words.quality(first.rate), "rate": words.percent(first.rate.value),
-        "best": first.name, "n": counts, "sentences": list(sentences),
+        "best": f"{first.name} ({first.conditions})", "n": counts, "sentences": list(sentences),
     }  # fmt: skip
 
 

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import beta, t
 
-from hno.report.aggregate import Rate, Recipe, best, excess, pool, recipes, rivals, spread, worst
+from hno.report.aggregate import Rate, Recipe, best, excess, headline, pool, recipes, rivals, spread, worst
 from hno.report.parsing import TypeResult
 from hno.report.runs import Run, load
 from hno.report.tables import recipe_table
@@ -143,11 +143,12 @@ def test_other_conditions_of_play_are_not_compared(tmp_path):
     write(tmp_path / "0", 0, (5, 5))
     write(tmp_path / "1", 0, (0, 0), operator="hno", noise=0.2)
     write(tmp_path / "2", 0, (0, 0), operator="narrow", table=[row(FIRST, 0, 100)])
-    write(tmp_path / "3", 0, (0, 0), operator="elsewhere", table=[row(FIRST, 0, 100), row((2.0, 2.0), 0, 100)])
+    write(tmp_path / "3", 0, (0, 0), operator="elsewhere", table=[row(FIRST, 50, 100), row((2.0, 2.0), 0, 100)])
     config = {"game": {"name": "drone", "constants": {"radius": 0.1}}, "seed": 0}
     write(tmp_path / "4", 0, (0, 0), operator="easy", config=config)
     found = recipes(loaded(tmp_path))
     assert len(best(found)) == 5
+    assert headline(best(found).values()).rate == (10, 200)
     assert any("radius 0.1" in recipe.conditions for recipe in found)
     assert all(rivals(chosen, found) == [] for chosen in best(found).values())
 
