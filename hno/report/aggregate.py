@@ -126,7 +126,8 @@ def pool(rows: Sequence[TypeResult]) -> TypeResult:
     """One type over seeds."""
     counted = total(rows)
     means = (mean(getattr(row, name) for row in rows) for name in ("distance", "excess", "label_cost"))
-    return TypeResult(rows[0].theta, any(row.seen for row in rows), *counted, *means)
+    extrapolated = any(row.extrapolated for row in rows)
+    return TypeResult(rows[0].theta, any(row.seen for row in rows), *counted, *means, extrapolated)
 
 
 def mean(values: Iterable[float | None]) -> float | None:

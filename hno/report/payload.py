@@ -34,8 +34,11 @@ def size(content: Any) -> int:
 
 
 def heat_map(rows: Sequence[TypeResult]) -> list[list[Any]]:
-    """Cells of a heat map: types, collisions, starts, seen, relative excess cost."""
-    return [[list(row.theta), row.collisions, row.starts, int(row.seen), _rounded(excess([row]), 4)] for row in rows]
+    """Cells of a heat map: types, collisions, starts, seen, relative excess cost, extrapolated."""
+    return [
+        [list(row.theta), row.collisions, row.starts, int(row.seen), _rounded(excess([row]), 4), int(row.extrapolated)]
+        for row in rows
+    ]
 
 
 def intervals(found: Iterable[Sequence[TypeResult]]) -> dict[str, tuple[float, ...]]:

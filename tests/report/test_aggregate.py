@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from scipy.stats import beta, t
 
 from hno.report.aggregate import Rate, Recipe, best, excess, headline, pool, recipes, rivals, spread, worst
-from hno.report.parsing import TypeResult
+from hno.report.parsing import TypeResult, type_result
+from hno.report.payload import heat_map
 from hno.report.runs import Run, load
 from hno.report.tables import recipe_table
 from hno.report.words import worst_type
@@ -64,6 +65,11 @@ def test_nothing_is_not_zero():
     assert Rate(0, 0).interval is None
     assert excess([result(FIRST, 0, 0)]) is None
     assert worst([result(FIRST, 0, 0)]) is None
+
+
+def test_types_outside_the_box_stay_marked_over_seeds_and_on_the_page():
+    (inside, outside) = (type_result(row(FIRST, 1) | {"extrapolated": flag}) for flag in (False, True))
+    assert [entry[-1] for entry in heat_map([inside, pool([outside, outside])])] == [0, 1]
 
 
 def test_where_nothing_collided_no_type_is_the_worst():

@@ -162,7 +162,7 @@ def test_no_safe_start_is_no_zero(tmp_path):
     write_run(tmp_path, results, extras=False)
     text = render(load(tmp_path))
     assert "the collision rate is n/a" in text
-    assert Page(text).data["maps"]["r0"] == [[[1.0, 1.0], 0, 0, 1, None]]
+    assert Page(text).data["maps"]["r0"] == [[[1.0, 1.0], 0, 0, 1, None, 0]]
 
 
 def test_types_that_are_not_pairs_have_numbers_and_no_map(tmp_path):
