@@ -195,8 +195,8 @@ def _decimal(text: Any) -> float | None:
 
 
 def flatten(value: Any, prefix: str = "") -> dict[str, str]:
-    """Nested mappings as dotted names with values as JSON text; text stays as it is."""
-    if isinstance(value, Mapping) and (value or not prefix):
+    """Nested mappings as dotted names with values as JSON text; text stays as it is, empty mappings have no name."""
+    if isinstance(value, Mapping):
         return {
             name: text
             for key, entry in value.items()

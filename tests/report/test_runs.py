@@ -27,6 +27,7 @@ def test_a_whole_run_is_read_without_remarks(tmp_path):
     assert len(run.episodes) == 6
     assert run.episodes[0].positions.shape == (51, 2, 3)
     assert run.settings["operator.width"] == "64"
+    assert "game.constants" not in run.settings
     assert len(run.curves["loss/total"][0]) == 40
     assert run.command == "python train.py game=drone operator=sno activation=tanh seed=0"
 
