@@ -56,6 +56,10 @@ class Spread(NamedTuple):
     seeds: int
 
 
+Comparable = tuple[str, str, frozenset[tuple[float, ...]]]
+"""Game, conditions and types."""
+
+
 class Recipe(NamedTuple):
     """Runs that differ in their seed only."""
 
@@ -65,7 +69,7 @@ class Recipe(NamedTuple):
     variant: str
     """Settings in which it differs from others of the same names; empty if there are none."""
     conditions: str
-    """How episodes were played, and at how many types."""
+    """Changed constants of the game, how episodes were played, and at how many types."""
     runs: tuple[Run, ...]
     """One finished run for every seed."""
     repeated: tuple[Run, ...]
@@ -77,6 +81,11 @@ class Recipe(NamedTuple):
     def name(self) -> str:
         """Operator, activation and what else is special."""
         return " / ".join(filter(None, (self.operator, self.activation, self.variant)))
+
+    @property
+    def comparable(self) -> Comparable:
+        """What recipes share whose numbers may be compared: the game with its constants, play, and the very types."""
+        return self.game, self.conditions, frozenset(row.theta for run in self.runs for row in run.table)
 
     @property
     def rate(self) -> Rate:
@@ -117,7 +126,8 @@ def pool(rows: Sequence[TypeResult]) -> TypeResult:
     """One type over seeds."""
     counted = total(rows)
     means = (mean(getattr(row, name) for row in rows) for name in ("distance", "excess", "label_cost"))
-    return TypeResult(rows[0].theta, any(row.seen for row in rows), *counted, *means)
+    extrapolated = any(row.extrapolated for row in rows)
+    return TypeResult(rows[0].theta, any(row.seen for row in rows), *counted, *means, extrapolated)
 
 
 def mean(values: Iterable[float | None]) -> float | None:
@@ -205,7 +215,7 @@ def _recipe(names: tuple[str, ...], variant: str, runs: Sequence[Run]) -> Recipe
     failed = sum(run.status == "failed" for run in runs)
     unfinished = len(runs) - len(counted) - len(repeated) - failed
     sizes = sorted({len(run.table) for run in counted})
-    conditions = ", ".join(sorted({run.conditions for run in counted} - {""}))
+    conditions = ", ".join(sorted({text for run in counted for text in (_constants(run), run.conditions)} - {""}))
     at = f"{' or '.join(map(str, sizes))} types" if sizes else NOT_AVAILABLE
     game, operator, activation = names
     return Recipe(
@@ -214,11 +224,16 @@ def _recipe(names: tuple[str, ...], variant: str, runs: Sequence[Run]) -> Recipe
     )  # fmt: skip
 
 
-def best(found: Iterable[Recipe]) -> dict[tuple[str, str], Recipe]:
-    """The recipe with the lowest collision rate, then the lowest excess cost, for every game and conditions of play."""
-    first: dict[tuple[str, str], Recipe] = {}
+def _constants(run: Run) -> str:
+    changed = {key: text for key, text in sorted(run.settings.items()) if key.startswith("game.constants.")}
+    return ", ".join(f"{key.removeprefix('game.constants.')} {text}" for key, text in changed.items())
+
+
+def best(found: Iterable[Recipe]) -> dict[Comparable, Recipe]:
+    """The recipe with the lowest collision rate, then the lowest excess cost, of all that may be compared."""
+    first: dict[Comparable, Recipe] = {}
     for recipe in found:
-        key = (recipe.game, recipe.conditions)
+        key = recipe.comparable
         if recipe.rate.starts and (key not in first or _order(recipe) < _order(first[key])):
             first[key] = recipe
     return first
@@ -228,15 +243,20 @@ def _order(recipe: Recipe) -> tuple[float, float]:
     return recipe.rate.value or 0.0, math.inf if recipe.excess is None else recipe.excess.mean
 
 
+def headline(found: Iterable[Recipe]) -> Recipe:
+    """Of the best recipes of a game the one at its usual constants and conditions, then at the most types."""
+    return min(found, key=lambda one: ("," in one.conditions, -len(one.comparable[2]), *_order(one)))
+
+
 def rivals(chosen: Recipe, found: Iterable[Recipe]) -> list[Recipe]:
-    """Recipes of the same game and conditions whose interval of the collision rate overlaps that of the chosen one."""
+    """Recipes that may be compared with the chosen one and whose interval of the collision rate overlaps its own."""
     inside = chosen.rate.interval
     assert inside is not None
     return [
         recipe
         for recipe in found
         if recipe is not chosen
-        and (recipe.game, recipe.conditions) == (chosen.game, chosen.conditions)
+        and recipe.comparable == chosen.comparable
         and recipe.rate.interval is not None
         and recipe.rate.interval[0] <= inside[1]
     ]

@@ -24,12 +24,13 @@ def _colors() -> list[alt.Parameter]:
     return [alt.param(name=name, value=color) for name, color in signals(LIGHT).items()]
 
 
-def heat_map(data: Any, legend: alt.Legend | None = None) -> Layers:
+def heat_map(data: Any, legend: alt.Legend | None = None, font: int | str = "bandwidth('x') < 26 ? 8 : 11") -> Layers:
     """Collision rates over the types of two players.
 
     Args:
         data: rows with theta_1, theta_2, shown (rate or one of its bounds, in [0, 1], or null), label, seen, tip.
         legend: of the colours; none by default.
+        font: size of numbers in cells, px, or an expression; one with the scale "x" holds for single charts only.
     """
     base = alt.Chart(data).encode(
         x=alt.X("theta_1:O", title="θ₁", axis=alt.Axis(labelAngle=0, ticks=False, domain=False, offset=2)),
@@ -45,7 +46,7 @@ def heat_map(data: Any, legend: alt.Legend | None = None) -> Layers:
         "datum.seen"
     )
     contrast = "datum.shown > 0 ? (luminance(scale('color', datum.shown)) < 0.2 ? '#fff' : '#111') : muted"
-    text = base.mark_text(fill=alt.expr(contrast), fontSize=alt.expr("bandwidth('x') < 26 ? 8 : 11"))
+    text = base.mark_text(fill=alt.expr(contrast), fontSize=font if isinstance(font, int) else alt.expr(font))
     return (
         alt.layer(none, some, nothing.transform_filter("datum.shown === null"), seen, text.encode(text="label:N"))
         .properties(width=alt.Step(CELL), height=alt.Step(CELL))
@@ -57,7 +58,8 @@ def comparison(data: Any) -> Layers:
     """Collision rates of recipes with their intervals, and of their seeds.
 
     Args:
-        data: rows with recipe, rate, low, high, seed (null for the pooled rate), tip; in the order to be shown.
+        data: rows with recipe, rate, low, high, seed (null for the pooled rate), count (a text beside the pooled rate),
+            tip; in the order to be shown.
     """
     base = alt.Chart(data).encode(
         y=alt.Y("recipe:N", sort=None, title=None, axis=alt.Axis(labelLimit=260, ticks=False, domain=False))
@@ -69,12 +71,16 @@ def comparison(data: Any) -> Layers:
     axis = alt.Axis(values=[0, 0.001, 0.01, 0.1, 1], labelExpr="100 * datum.value + ' %'")
     rate = alt.X("rate:Q", scale=scale, axis=axis, title="collisions of safe starts")
     dot = pooled.mark_circle(size=90, opacity=1, color=alt.expr("datum.rate > 0 ? danger : ink"))
+    count = pooled.mark_text(
+        fontSize=9, dy=-9, align=alt.expr("datum.rate > 0.1 ? 'right' : 'left'"), fill=alt.expr("ink")
+    )
     ring = seeds.mark_point(size=28, strokeWidth=1, opacity=0.8, color=alt.expr("muted"))
     return (
         alt.layer(
             band.encode(x=alt.X("low:Q", scale=scale), x2="high:Q", tooltip="tip:N"),
             ring.encode(x=rate, tooltip="tip:N"),
             dot.encode(x=rate, tooltip="tip:N"),
+            count.encode(x=rate, text="count:N"),
         )
         .properties(width="container", height=alt.Step(26))
         .add_params(*_colors())

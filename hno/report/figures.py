@@ -15,16 +15,18 @@ from numpy.typing import NDArray
 
 from hno.data.store import replace_whole
 from hno.report import charts, payload, words
-from hno.report.aggregate import Rate, Recipe, best, recipes
+from hno.report.aggregate import Rate, Recipe, best, headline, recipes
 from hno.report.kernels import condition_table
 from hno.report.palette import LIGHT, chart_config
 from hno.report.parsing import Episode, TypeResult
 from hno.report.runs import Sweep
-from hno.report.tables import Table, recipe_table
+from hno.report.tables import CACHED, Table, recipe_table
 
 WIDE, HIGH = 420, 170
 """Size of a view of an encounter, px."""
 KINDS = ("worst", "typical")
+LEGEND = alt.Legend(title="rate", format=".1%", values=[0.001, 0.01, 0.1, 1], gradientLength=120)
+"""Of the colours of heat maps."""
 
 
 def write_figures(sweep: Sweep, folder: Path) -> list[Path]:
@@ -70,17 +72,22 @@ def collision_figure(found: Sequence[Recipe]) -> alt.ConcatChart | None:
     """One heat map for every recipe of a game, seen types framed; None where there is nothing to show."""
     shown = [recipe for recipe in found if recipe.table and all(len(row.theta) == 2 for row in recipe.table)]
     maps = [
-        charts.heat_map(_inline(heat_cells(recipe.table))).properties(
-            title=alt.TitleParams(
-                recipe.name, subtitle=f"{words.share(recipe.rate)}, {words.seeds(recipe)}", anchor="start"
-            )
+        charts.heat_map(_inline(heat_cells(recipe.table)), LEGEND if k == 0 else None, font=12).properties(
+            title=alt.TitleParams(recipe.name, subtitle=_counts(recipe), anchor="start")
         )
-        for recipe in shown
+        for k, recipe in enumerate(shown)
     ]
     if not maps:
         return None
     title = alt.TitleParams(f"{shown[0].game}: collisions of safe starts in %; framed: types with training labels")
     return alt.concat(*maps, columns=math.isqrt(len(maps) - 1) + 1, spacing=30, title=title)
+
+
+def _counts(recipe: Recipe) -> list[str]:
+    """How many starts and seeds a map is made of, as a whole and type by type."""
+    starts = [row.starts for row in recipe.table]
+    each = f"{min(starts):,}" if min(starts) == max(starts) else f"{min(starts):,} to {max(starts):,}"
+    return [f"{words.share(recipe.rate)}, {words.seeds(recipe)}", f"{each} safe starts per type"]
 
 
 def _inline(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -94,12 +101,19 @@ def heat_cells(rows: Sequence[TypeResult]) -> list[dict[str, Any]]:
             "theta_1": row.theta[0],
             "theta_2": row.theta[1],
             "shown": rate,
-            "label": "n/a" if rate is None else ("0" if rate == 0 else f"{100 * rate:.{1 if rate < 0.0995 else 0}f}"),
+            "label": _label(rate),
             "seen": row.seen,
         }
         for row in rows
         for rate in [Rate(row.collisions, row.starts).value]
     ]
+
+
+def _label(rate: float | None) -> str:
+    """A rate in %, short enough for a cell."""
+    if not rate:
+        return "n/a" if rate is None else "0"
+    return "<0.1" if rate < 0.0005 else f"{100 * rate:.{1 if rate < 0.0995 else 0}f}"
 
 
 def comparison_figure(found: Sequence[Recipe]) -> alt.TopLevelMixin | None:
@@ -113,7 +127,7 @@ def encounter_figures(found: Sequence[Recipe]) -> dict[str, alt.TopLevelMixin]:
     chosen = [recipe for recipe in best(found).values() if any(run.episodes for run in recipe.runs)]
     if not chosen:
         return {}
-    recipe = min(chosen, key=lambda one: one.rate.value or 0.0)
+    recipe = headline(chosen)
     views: dict[str, alt.TopLevelMixin] = {}
     for kind in KINDS:
         own = [episode for run in recipe.runs for episode in run.episodes if episode.kind == kind]
@@ -174,7 +188,7 @@ def markdown(sweep: Sweep, found: Sequence[Recipe]) -> str:
     """Verdicts and tables."""
     parts = [f"# {sweep.name}", words.jobs(sweep)]
     parts += [f"- **{game}**, {one.name}, {words.share(one.rate)}. {text}" for game, one, text in words.verdicts(found)]
-    parts += ["## Recipes", table_text(recipe_table(found)), "## Time", table_text(cost_table(found))]
+    parts += ["## Recipes", table_text(recipe_table(found)), "## Time", table_text(cost_table(found)), CACHED]
     kernels = condition_table(sweep.runs)
     parts += ["## Condition numbers of the tangent kernel", table_text(kernels)] if kernels.rows else []
     missing = [f"- {run.name}: {words.why(run)}" for run in sweep.runs if not run.finished]

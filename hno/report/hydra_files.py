@@ -56,14 +56,18 @@ def sweep_of(path: Path) -> tuple[str | None, int | None]:
     overrides = _dig(content, "hydra", "overrides", "task")
     if not isinstance(overrides, list):
         return None, None
-    return _command_line(content, ["-m", *overrides]), _jobs([str(entry) for entry in overrides])
+    params = _dig(content, "hydra", "sweeper", "params")
+    swept = [f"{key}={value}" for key, value in params.items()] if isinstance(params, dict) else []
+    return _command_line(content, ["-m", *overrides]), _jobs([*swept, *map(str, overrides)])
 
 
 def _jobs(overrides: list[str]) -> int | None:
+    """Number of jobs; of overrides of one key, the last counts, as for Hydra."""
     try:
         parsed = OverridesParser.create().parse_overrides(overrides)
+        last = {entry.get_key_element(): entry for entry in parsed}
         return math.prod(
-            len(list(entry.sweep_string_iterator())) if entry.is_sweep_override() else 1 for entry in parsed
+            len(list(entry.sweep_string_iterator())) if entry.is_sweep_override() else 1 for entry in last.values()
         )
     except HydraException:
         return None

@@ -6,6 +6,7 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+from hno.evaluation.spectrum import Ratio, Summary, condition_ratio
 from hno.report.parsing import UnreadableError, number, records, types, whole
 from hno.report.runs import NOT_AVAILABLE, Run
 from hno.report.tables import Cell, Row, Table
@@ -17,67 +18,86 @@ REFERENCE = "tanh"
 """The activation whose condition number is divided by those of the others."""
 
 
-class Condition(NamedTuple):
-    """A condition number; where the matrix is cut off, a lower bound of it."""
+class Key(NamedTuple):
+    """What kernels share that may be compared."""
 
-    value: float
-    exact: bool
+    game: str
+    operator: str
+    seed: str
+    """Of the training."""
+    types: tuple[float, ...]
+    points: int
+    rows: int
+    kind: str
 
-    @property
-    def text(self) -> str:
-        """As it is written."""
-        return f"{'' if self.exact else '> '}{self.value:.3g}"
 
-
-Key = tuple[str, str, str, tuple[float, ...], str]
-"""Game, operator, training seed, types, kind of kernel."""
+Line = tuple[str, Mapping[str, Summary]]
+"""Name of the run that a line is about, empty where there is one for every activation; spectra by activation."""
 
 
 def condition_table(runs: Sequence[Run]) -> Table:
-    """One line for every game, operator, training seed, type and kind of kernel."""
-    found: dict[Key, dict[str, Condition]] = defaultdict(dict)
+    """One line for every game, operator, training seed, type, size and kind of kernel.
+
+    Where several runs share all of that and the activation, each has a line of its own, beside activations of one run.
+    """
+    found: dict[Key, dict[str, list[tuple[str, Summary]]]] = defaultdict(lambda: defaultdict(list))
     for run in runs:
         for entry in records(run.content.get("ntk")):
-            for key, condition in _conditions(run, entry):
-                found[key][run.activation] = condition
-    names = sorted({name for conditions in found.values() for name in conditions})
+            for key, spectrum in _spectra(run, entry):
+                found[key][run.activation].append((run.name, spectrum))
+    lines = [(key, line) for key in sorted(found) for line in _lines(found[key])]
+    names = sorted({name for _, (_, spectra) in lines for name in spectra})
     others = [name for name in names if name != REFERENCE] if REFERENCE in names else []
-    columns = ["game", "operator", "seed", "types", "kernel", *names, *(f"{REFERENCE} / {name}" for name in others)]
-    return Table(columns, [Row(_cells(key, found[key], names, others)) for key in sorted(found)])
+    columns = ["game", "operator", "seed", "types", "points", "rows", "kernel", "run"]
+    columns += [*names, *(f"{REFERENCE} / {name}" for name in others)]
+    return Table(columns, [Row(_cells(key, line, names, others)) for key, line in lines])
 
 
-def _conditions(run: Run, entry: Mapping[str, Any]) -> list[tuple[Key, Condition]]:
+def _lines(found: Mapping[str, Sequence[tuple[str, Summary]]]) -> list[Line]:
+    single = {name: entries[0][1] for name, entries in found.items() if len(entries) == 1}
+    several = {name: entries for name, entries in found.items() if len(entries) > 1}
+    lines = [(run, {**single, name: spectrum}) for name, entries in several.items() for run, spectrum in entries]
+    return lines or [("", single)]
+
+
+def _spectra(run: Run, entry: Mapping[str, Any]) -> list[tuple[Key, Summary]]:
     try:
         at = types(entry.get("theta"))
     except UnreadableError:
         return []
-    seed = NOT_AVAILABLE if run.seed is None else str(run.seed)
-    known = [(kind, _condition(entry.get(kind))) for kind in KINDS]
-    return [((run.game, run.operator, seed, at, kind), one) for kind, one in known if one is not None]
+    seed, points = NOT_AVAILABLE if run.seed is None else str(run.seed), whole(entry.get("points")) or 0
+    known = [(kind, _sound(entry.get(kind))) for kind in KINDS]
+    return [(Key(run.game, run.operator, seed, at, points, s["rows"], kind), s) for kind, s in known if s is not None]
 
 
-def _condition(found: Any) -> Condition | None:
+def _sound(found: Any) -> Summary | None:
+    """What `condition_ratio` needs of a spectrum; None where that is missing."""
     if not isinstance(found, dict):
         return None
-    value, cutoff = number(found.get("condition")), number(found.get("cutoff"))
-    rank, rows = whole(found.get("rank")), whole(found.get("rows"))
-    if value is None or rank is None or rows is None:
-        return None
-    if rank == rows:
-        return Condition(value, True)
-    return Condition(1 / cutoff, False) if cutoff else None
+    sound = {name: number(found.get(name)) for name in ("condition", "cutoff")}
+    sound |= {name: whole(found.get(name)) for name in ("rank", "rows")}
+    return sound if all(sound.values()) else None
 
 
-def _cells(key: Key, found: Mapping[str, Condition], names: Sequence[str], others: Sequence[str]) -> list[Cell]:
-    game, operator, seed, at, kind = key
-    values = [Cell(found[name].text) if name in found else Cell(NOT_AVAILABLE) for name in names]
-    ratios = [Cell(ratio(found.get(REFERENCE), found.get(name))) for name in others]
-    return [Cell(game), Cell(operator), Cell(seed), Cell(theta(at)), Cell(KINDS[kind]), *values, *ratios]
+def _cells(key: Key, line: Line, names: Sequence[str], others: Sequence[str]) -> list[Cell]:
+    run, spectra = line
+    known = [key.game, key.operator, key.seed, theta(key.types), str(key.points), str(key.rows), KINDS[key.kind], run]
+    values = [_value(spectra[name]) if name in spectra else NOT_AVAILABLE for name in names]
+    ratios = [
+        _ratio(condition_ratio(spectra[REFERENCE], spectra[name]))
+        if {REFERENCE, name} <= set(spectra)
+        else NOT_AVAILABLE
+        for name in others
+    ]
+    return [Cell(text) for text in (*known, *values, *ratios)]
 
 
-def ratio(over: Condition | None, under: Condition | None) -> str:
-    """A ratio of condition numbers, or a bound where one of them is one; "n/a" where both are."""
-    if over is None or under is None or not (over.exact or under.exact):
+def _value(found: Summary) -> str:
+    whole_rank = found["rank"] == found["rows"]
+    return f"{found['condition']:.3g}" if whole_rank else f"> {1 / found['cutoff']:.3g}"
+
+
+def _ratio(found: Ratio) -> str:
+    if found.value is None:
         return NOT_AVAILABLE
-    sign = "" if over.exact and under.exact else ("< " if over.exact else "> ")
-    return f"{sign}{over.value / under.value:.3g}"
+    return f"{found.value:.3g}" if found.bound == "=" else f"{found.bound} {found.value:.3g}"

@@ -13,16 +13,17 @@ from markupsafe import Markup
 
 from hno.data.store import replace_whole
 from hno.report import payload, words
-from hno.report.aggregate import Recipe, best, recipes, total, worst
+from hno.report.aggregate import Recipe, best, headline, recipes, total, worst
 from hno.report.charts import library, specifications
+from hno.report.further import fitting, further
 from hno.report.palette import DARK, FONT, LIGHT, Palette, chart_config, signals
 from hno.report.runs import NOT_AVAILABLE, Run, Sweep
-from hno.report.tables import generic, label_tables, names_of, recipe_table, run_table, sections
+from hno.report.tables import CACHED, generic, label_tables, names_of, recipe_table, run_table
 
 LIMIT = 3_000_000
 """Most bytes of a page."""
-SECTION_RUNS = 40
-"""Runs whose further evaluations are shown."""
+SECTION_BYTES = 800_000
+"""Most bytes of further evaluations."""
 ASSETS = files("hno.report") / "assets"
 SCRIPTS = ("base.js", "filters.js", "tables.js", "charts.js", "player.js", "refresh.js")
 
@@ -40,11 +41,17 @@ def write_page(sweep: Sweep, path: Path, refresh: float | None = None) -> None:
 
 
 def render(sweep: Sweep, refresh: float | None = None) -> str:
-    """The page as text; episodes take what room the rest leaves."""
+    """The page as text; further evaluations take what room the rest leaves, then episodes."""
     content, data = _content(sweep, refresh)
-    empty = _fill(content, data, payload.Budgeted([], 0, 0))
-    room = LIMIT - len(empty.encode()) - 20_000
-    return _fill(content, data, payload.episodes(sweep.runs, max(0, room)))
+    told = further(sweep.runs)
+    content |= {"sections": [], "sections_total": len(told)}
+    content["sections"] = fitting(told, min(SECTION_BYTES, _room(content, data)))
+    return _fill(content, data, payload.episodes(sweep.runs, max(0, _room(content, data))))
+
+
+def _room(content: Mapping[str, Any], data: Mapping[str, Any]) -> int:
+    """Bytes that a page without episodes leaves, with some to spare."""
+    return LIMIT - len(_fill(content, data, payload.Budgeted([], 0, 0)).encode()) - 20_000
 
 
 def _fill(content: Mapping[str, Any], data: Mapping[str, Any], played: payload.Budgeted) -> str:
@@ -89,6 +96,7 @@ def _content(sweep: Sweep, refresh: float | None) -> tuple[dict[str, Any], dict[
         "filters": {name: _choices(sweep.runs, name) for name in ("game", "operator", "activation", "seed")},
         "cards": [card for card in cards if card["id"] in maps],
         "cards_total": len(cards),
+        "cached": CACHED,
         "recipe_table": recipe_table(found),
         "run_table": run_table(sweep.runs),
         "problems": [(run.name, run.status, words.why(run)[:600]) for run in sweep.runs if not run.finished],
@@ -99,9 +107,6 @@ def _content(sweep: Sweep, refresh: float | None) -> tuple[dict[str, Any], dict[
         "curve_games": sorted({entry["game"] for entry in curves.content}),
         "compared_games": sorted({recipe.game for recipe in found if recipe.rate.starts}),
         "labels": label_tables(sweep.runs),
-        "sections": [(run.name, names_of(run, "any"), sections(run)) for run in sweep.runs if sections(run)][
-            :SECTION_RUNS
-        ],
         "common": common,
         "differing": differing,
         "versions": _versions(sweep.runs),
@@ -150,8 +155,8 @@ def _gradient(palette: Palette) -> str:
 def _games(found: Sequence[Recipe]) -> list[dict[str, Any]]:
     """One card of the summary for every game."""
     chosen: dict[str, list[Recipe]] = {}
-    for (game, _), recipe in best(found).items():
-        chosen.setdefault(game, []).append(recipe)
+    for recipe in best(found).values():
+        chosen.setdefault(recipe.game, []).append(recipe)
     sentences: dict[str, list[str]] = {}
     for game, _, text in words.verdicts(found):
         sentences.setdefault(game, []).append(text)
@@ -163,11 +168,11 @@ def _game(game: str, chosen: Sequence[Recipe], sentences: Sequence[str]) -> dict
     if not chosen:
         text = f"Nothing was played: the collision rate is {NOT_AVAILABLE}."
         return {"name": game, "quality": "unknown", "rate": NOT_AVAILABLE, "best": "", "n": "", "sentences": [text]}
-    first = min(chosen, key=lambda recipe: recipe.rate.value or 0.0)
+    first = headline(chosen)
     counts = f"{first.rate.collisions:,} of {first.rate.starts:,}"
     return {
         "name": game, "quality": words.quality(first.rate), "rate": words.percent(first.rate.value),
-        "best": first.name, "n": counts, "sentences": list(sentences),
+        "best": f"{first.name} ({first.conditions})", "n": counts, "sentences": list(sentences),
     }  # fmt: skip
 
 

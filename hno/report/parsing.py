@@ -32,6 +32,8 @@ class TypeResult(NamedTuple):
     """Median over starts of the joint cost above the equilibrium's."""
     label_cost: float | None
     """Median over starts of the equilibrium's joint cost."""
+    extrapolated: bool = False
+    """Whether the types lie outside the box that the game is declared for."""
 
 
 class Episode(NamedTuple):
@@ -103,7 +105,7 @@ def type_result(row: Any) -> TypeResult:
     return TypeResult(
         types(row.get("theta")), row.get("seen") is True, collisions, starts,
         number(row.get("median_min_distance")), number(row.get("median_excess_cost")),
-        number(row.get("median_label_cost")),
+        number(row.get("median_label_cost")), row.get("extrapolated") is True,
     )  # fmt: skip
 
 
@@ -193,8 +195,8 @@ def _decimal(text: Any) -> float | None:
 
 
 def flatten(value: Any, prefix: str = "") -> dict[str, str]:
-    """Nested mappings as dotted names with values as JSON text; text stays as it is."""
-    if isinstance(value, Mapping) and (value or not prefix):
+    """Nested mappings as dotted names with values as JSON text; text stays as it is, empty mappings have no name."""
+    if isinstance(value, Mapping):
         return {
             name: text
             for key, entry in value.items()

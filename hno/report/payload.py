@@ -34,8 +34,11 @@ def size(content: Any) -> int:
 
 
 def heat_map(rows: Sequence[TypeResult]) -> list[list[Any]]:
-    """Cells of a heat map: types, collisions, starts, seen, relative excess cost."""
-    return [[list(row.theta), row.collisions, row.starts, int(row.seen), _rounded(excess([row]), 4)] for row in rows]
+    """Cells of a heat map: types, collisions, starts, seen, relative excess cost, extrapolated."""
+    return [
+        [list(row.theta), row.collisions, row.starts, int(row.seen), _rounded(excess([row]), 4), int(row.extrapolated)]
+        for row in rows
+    ]
 
 
 def intervals(found: Iterable[Sequence[TypeResult]]) -> dict[str, tuple[float, ...]]:
@@ -54,6 +57,7 @@ def _compared(recipe: Recipe) -> list[dict[str, Any]]:
     names = {"game": recipe.game, "operator": recipe.operator, "activation": recipe.activation, "recipe": recipe.name}
     low, high = recipe.rate.interval or (None, None)
     pooled = {**names, "seed": None, "rate": recipe.rate.value, "low": low, "high": high}
+    pooled["count"] = f"{recipe.rate.collisions:,} of {recipe.rate.starts:,}"
     pooled["tip"] = f"{recipe.name}, {len(recipe.runs)} seeds\n{rate(recipe.rate)}"
     return [pooled, *({**names, **entry} for entry in map(_seed, recipe.runs))]
 
@@ -62,7 +66,7 @@ def _seed(run: Run) -> dict[str, Any]:
     counts = Rate(sum(row.collisions for row in run.table), sum(row.starts for row in run.table))
     low, high = counts.interval or (None, None)
     most = worst(run.table)
-    at = "" if most is None else f"\nworst type {theta(most.theta)}"
+    at = "" if most is None or not most.collisions else f"\nworst type {theta(most.theta)}"
     seed = "n/a" if run.seed is None else run.seed
     return {"seed": seed, "rate": counts.value, "low": low, "high": high, "tip": f"seed {seed}: {rate(counts)}{at}"}
 

@@ -8,24 +8,16 @@ from typing import Any, NamedTuple
 
 from hno.report.aggregate import Recipe, Spread, best, excess, seconds, total, worst
 from hno.report.parsing import number as sound
-from hno.report.parsing import records, whole
+from hno.report.parsing import whole
 from hno.report.runs import ENDED, NOT_AVAILABLE, Run, label_statistics
-from hno.report.words import interval, number, over_seeds, percent, signed, theta
+from hno.report.words import interval, number, over_seeds, percent, signed, theta, worst_type
 
 LONGEST = 400
 """Characters of a cell that are kept."""
 LISTED = 6
 """Numbers of a list that are shown."""
 ROWS = 200
-"""Rows of an evaluation's table that are kept."""
-SECTIONS = {
-    "robustness": "Robustness",
-    "residuals": "HJI residual by region",
-    "ntk": "Neural tangent kernel",
-    "online": "Online solver as a yardstick",
-    "comparison": "Models side by side",
-}
-"""Further results of evaluate.py, rendered where they are."""
+"""Rows of any list that are kept."""
 
 
 class Cell(NamedTuple):
@@ -45,10 +37,16 @@ class Row(NamedTuple):
 
 
 class Table(NamedTuple):
-    """Columns and rows; `numeric` tells which columns are aligned as numbers."""
+    """Columns and rows."""
 
     columns: list[str]
     rows: list[Row]
+    total: int | None = None
+    """Rows that there are, where some may have been left out."""
+
+    def first(self, count: int) -> Table:
+        """The first rows."""
+        return self._replace(rows=self.rows[:count], total=self.total or len(self.rows))
 
 
 def names_of(entry: Run | Recipe, level: str) -> dict[str, str]:
@@ -73,22 +71,31 @@ def recipe_table(found: Sequence[Recipe]) -> Table:
 def _recipe(recipe: Recipe) -> list[Cell]:
     counts, rates, most = recipe.rate, recipe.rates, worst(recipe.table)
     across = NOT_AVAILABLE if rates is None else f"{percent(rates.low)} to {percent(rates.high)}"
-    at = NOT_AVAILABLE if most is None else f"{theta(most.theta)} {percent(most.collisions / most.starts)}"
     return [
         Cell(recipe.game), Cell(recipe.name), Cell(str(len(recipe.runs)), len(recipe.runs)),
         Cell(f"{counts.starts:,}", counts.starts), Cell(f"{counts.collisions:,}", counts.collisions),
         Cell(percent(counts.value), counts.value),
         Cell(interval(counts.interval), (counts.interval or (None, None))[1]),
         Cell(across, None if rates is None else rates.high),
-        Cell(at, None if most is None else most.collisions / most.starts),
+        Cell(worst_type(most), None if most is None else most.collisions / most.starts),
         Cell(over_seeds(recipe.excess), None if recipe.excess is None else recipe.excess.mean),
-        *(_seconds(recipe.seconds(part)) for part in ("labels", "training", "total")),
+        _cached(recipe.seconds("labels")), *(_seconds(recipe.seconds(part)) for part in ("training", "total")),
         Cell(str(recipe.unfinished), recipe.unfinished), Cell(str(recipe.failed), recipe.failed),
     ]  # fmt: skip
 
 
 def _seconds(found: Spread | None) -> Cell:
     return Cell(NOT_AVAILABLE) if found is None else Cell(number(found.mean, 0), found.mean)
+
+
+CACHED = "Labels that were cached took no time, and the total is then without them."
+
+
+def _cached(found: Spread | None) -> Cell:
+    """Time for labels; no time is said to be the cache's."""
+    if found is None or found.low > 0:
+        return _seconds(found)
+    return Cell("cached" if found.high == 0 else f"{number(found.mean, 0)} (partly cached)", found.mean)
 
 
 RUN_COLUMNS = [
@@ -108,7 +115,6 @@ def _mark(run: Run) -> str:
 
 def _run(run: Run) -> list[Cell]:
     counts, most, above, steps = total(run.table), worst(run.table), excess(run.table), whole(run.content.get("steps"))
-    at = NOT_AVAILABLE if most is None else f"{theta(most.theta)} {percent(most.collisions / most.starts)}"
     metrics = run.content.get("metrics")
     errors = [
         sound(metrics.get(f"val/{name}_error")) if isinstance(metrics, dict) else None for name in ("value", "costate")
@@ -123,7 +129,7 @@ def _run(run: Run) -> list[Cell]:
         Cell(f"{counts.collisions:,}" if played else NOT_AVAILABLE, counts.collisions if played else None),
         Cell(percent(counts.value), counts.value),
         Cell(interval(counts.interval), (counts.interval or (None, None))[1]),
-        Cell(at, None if most is None else most.collisions / most.starts), Cell(signed(above), above),
+        Cell(worst_type(most), None if most is None else most.collisions / most.starts), Cell(signed(above), above),
         *(Cell(number(error, 4), error) for error in errors), Cell(number(spent, 0), spent),
     ]  # fmt: skip
 
@@ -133,7 +139,9 @@ def generic(entries: Sequence[Mapping[str, Any]]) -> Table:
     rows = [_flat(entry) for entry in entries[:ROWS]]
     columns = list(dict.fromkeys(key for row in rows for key in row))
     return Table(
-        columns, [Row([value_cell(row[key], key) if key in row else Cell("") for key in columns]) for row in rows]
+        columns,
+        [Row([value_cell(row[key], key) if key in row else Cell("") for key in columns]) for row in rows],
+        len(entries),
     )
 
 
@@ -164,21 +172,6 @@ def value_cell(value: Any, column: str = "") -> Cell:
         return Cell(interval((numbers[0], numbers[1])) if last == "interval" and len(numbers) == 2 else theta(numbers))
     text = value if isinstance(value, str) else json.dumps(value, sort_keys=True)
     return Cell(text if len(text) <= LONGEST else f"{text[:LONGEST]}…")
-
-
-def sections(run: Run) -> dict[str, Table]:
-    """Tables of the further results of a run, by heading."""
-    found: dict[str, Table] = {}
-    for key, heading in SECTIONS.items():
-        content = run.content.get(key)
-        if isinstance(content, dict) and content:
-            lists = {name: entry for name, entry in content.items() if records(entry)}
-            rest = {name: entry for name, entry in content.items() if name not in lists}
-            found |= {heading: generic([rest])} if rest else {}
-            found |= {f"{heading}: {name}": generic(records(entry)) for name, entry in lists.items()}
-        elif records(content):
-            found[heading] = generic(records(content))
-    return found
 
 
 def label_tables(runs: Sequence[Run]) -> list[tuple[str, int, Table]]:

@@ -33,7 +33,8 @@ def totals(table: Sequence[Mapping[str, Any]]) -> Totals:
     collisions, safe = (sum(row[name] for row in table) for name in ("collisions", "safe_starts"))
     counted = [row for row in table if row["rate"] is not None]
     worst = max(counted, key=lambda row: row["rate"], default=None)
-    ratios = [row["median_excess_cost"] / abs(row["median_label_cost"]) for row in counted if row["median_label_cost"]]
+    costs = [(row["median_excess_cost"], row["median_label_cost"]) for row in counted]
+    ratios = [above / abs(cost) for above, cost in costs if above is not None and cost]
     return Totals(
         collisions=collisions,
         safe_starts=safe,

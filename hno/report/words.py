@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from hno.report.aggregate import Rate, Recipe, Spread, best, rivals, worst
+from hno.report.parsing import TypeResult
 from hno.report.runs import NOT_AVAILABLE, Run, Sweep
 
 
@@ -56,6 +57,13 @@ def share(found: Rate) -> str:
     return f"{found.collisions:,} of {found.starts:,}: {percent(found.value)}"
 
 
+def worst_type(found: TypeResult | None) -> str:
+    """The type with the highest rate: "none" where nothing collided, "n/a" without starts."""
+    if found is None:
+        return NOT_AVAILABLE
+    return f"{theta(found.theta)} {percent(found.collisions / found.starts)}" if found.collisions else "none"
+
+
 def clearance(value: float | None) -> str:
     """How close an episode came."""
     if value is None:
@@ -101,10 +109,10 @@ def quality(found: Rate) -> str:
 
 def verdicts(recipes: Sequence[Recipe]) -> list[tuple[str, Recipe, str]]:
     """Game, its best recipe and a judgement of it, for every game and conditions of play."""
-    return [(game, one, _verdict(one, conditions, recipes)) for (game, conditions), one in best(recipes).items()]
+    return [(one.game, one, _verdict(one, recipes)) for one in best(recipes).values()]
 
 
-def _verdict(recipe: Recipe, conditions: str, recipes: Sequence[Recipe]) -> str:
+def _verdict(recipe: Recipe, recipes: Sequence[Recipe]) -> str:
     judged = {"safe": "No start collides", "rare": "Collisions are rare", "unsafe": "Not safe"}[quality(recipe.rate)]
     most = worst(recipe.table)
     at = ""
@@ -113,7 +121,7 @@ def _verdict(recipe: Recipe, conditions: str, recipes: Sequence[Recipe]) -> str:
     others = [other.name for other in rivals(recipe, recipes)]
     rest = f" Not told apart from {_list(others)}: the intervals overlap." if others else ""
     return (
-        f"{judged} ({seeds(recipe)}, {conditions}): 95 % interval {interval(recipe.rate.interval)}.{at} "
+        f"{judged} ({seeds(recipe)}, {recipe.conditions}): 95 % interval {interval(recipe.rate.interval)}.{at} "
         f"Joint cost above the equilibrium's: {over_seeds(recipe.excess)}.{rest}"
     )
 

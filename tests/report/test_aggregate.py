@@ -12,9 +12,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import beta, t
 
-from hno.report.aggregate import Rate, Recipe, best, excess, pool, recipes, rivals, spread, worst
-from hno.report.parsing import TypeResult
+from hno.report.aggregate import Rate, Recipe, best, excess, headline, pool, recipes, rivals, spread, worst
+from hno.report.parsing import TypeResult, type_result
+from hno.report.payload import heat_map
 from hno.report.runs import Run, load
+from hno.report.tables import recipe_table
+from hno.report.words import worst_type
 from tests.report.folders import make_results, row, write_run
 
 FIRST, SECOND = (1.0, 1.0), (5.0, 5.0)
@@ -64,6 +67,17 @@ def test_nothing_is_not_zero():
     assert worst([result(FIRST, 0, 0)]) is None
 
 
+def test_types_outside_the_box_stay_marked_over_seeds_and_on_the_page():
+    (inside, outside) = (type_result(row(FIRST, 1) | {"extrapolated": flag}) for flag in (False, True))
+    assert [entry[-1] for entry in heat_map([inside, pool([outside, outside])])] == [0, 1]
+
+
+def test_where_nothing_collided_no_type_is_the_worst():
+    assert worst_type(worst([result(FIRST, 0, 0)])) == "n/a"
+    assert worst_type(worst([result(FIRST, 0, 9), result(SECOND, 0, 9)])) == "none"
+    assert worst_type(worst([result(FIRST, 0, 9), result(SECOND, 1, 10)])) == "(5, 5) 10.00 %"
+
+
 def test_counts_are_pooled_and_other_numbers_averaged():
     pooled = pool([result(FIRST, 1, 100, 2.0), result(FIRST, 4, 50, None), result(FIRST, 0, 50, 4.0)])
     assert (pooled.collisions, pooled.starts, pooled.excess) == (5, 200, 3.0)
@@ -86,6 +100,14 @@ def test_seeds_of_one_recipe_are_one_line(tmp_path):
     assert (recipe.rates.low, recipe.rates.high) == (1 / 200, 7 / 200)
     assert recipe.seconds("labels").mean == 1.5
     assert recipe.variant == ""
+
+
+@pytest.mark.parametrize(("seeds", "shown"), [((0,), "cached"), ((0, 1), "5 (partly cached)"), ((1, 2), "15")])
+def test_labels_from_the_cache_are_said_to_be(tmp_path, seeds, shown):
+    for seed in seeds:
+        write(tmp_path / str(seed), seed, (0, 1), seconds={"labels": 10.0 * seed, "training": 50.0})
+    table = recipe_table(recipes(loaded(tmp_path)))
+    assert table.rows[0].cells[table.columns.index("labels s")].text == shown
 
 
 def test_another_setting_is_another_recipe_and_says_which(tmp_path):
@@ -127,8 +149,13 @@ def test_other_conditions_of_play_are_not_compared(tmp_path):
     write(tmp_path / "0", 0, (5, 5))
     write(tmp_path / "1", 0, (0, 0), operator="hno", noise=0.2)
     write(tmp_path / "2", 0, (0, 0), operator="narrow", table=[row(FIRST, 0, 100)])
+    write(tmp_path / "3", 0, (0, 0), operator="elsewhere", table=[row(FIRST, 50, 100), row((2.0, 2.0), 0, 100)])
+    config = {"game": {"name": "drone", "constants": {"radius": 0.1}}, "seed": 0}
+    write(tmp_path / "4", 0, (0, 0), operator="easy", config=config)
     found = recipes(loaded(tmp_path))
-    assert len(best(found)) == 3
+    assert len(best(found)) == 5
+    assert headline(best(found).values()).rate == (10, 200)
+    assert any("radius 0.1" in recipe.conditions for recipe in found)
     assert all(rivals(chosen, found) == [] for chosen in best(found).values())
 
 

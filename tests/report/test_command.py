@@ -52,7 +52,7 @@ def test_a_folder_that_cannot_be_written_ends_with_one(tmp_path, capsys):
 def test_seconds_that_make_no_sense_are_refused(tmp_path, text, capsys):
     with pytest.raises(SystemExit):
         main([str(tmp_path), "--watch", text])
-    assert "--watch" in capsys.readouterr().err
+    assert f"--watch: expected a number of seconds of at least 1; got {text!r}" in capsys.readouterr().err
 
 
 def test_a_missing_package_is_named_with_the_remedy(tmp_path, monkeypatch, capsys):

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from hno.report.aggregate import recipes
-from hno.report.figures import markdown, summary, write_figures
+from hno.report.figures import heat_cells, markdown, summary, write_figures
 from hno.report.kernels import condition_table
+from hno.report.parsing import TypeResult
 from hno.report.runs import load
 from tests.report.folders import GRID5, make_results, row, write_run
 
@@ -51,6 +52,31 @@ def test_the_summary_repeats_the_counts(tmp_path):
     assert "3 of 150" in text
 
 
+def drawn(texts):
+    return [text for text in ET.fromstring(texts).itertext() if text.strip()]
+
+
+def test_figures_show_their_counts(tmp_path):
+    table = [row((1.0, 1.0), 3, 100), row((5.0, 5.0), 0, 50)]
+    for operator in ("hno", "sno"):
+        write_run(tmp_path / operator, results(table=table, operator=operator), extras=False)
+    write_figures(load(tmp_path), tmp_path / "figures")
+    comparison, maps = (
+        drawn((tmp_path / "figures" / f"{name}_drone.svg").read_text()) for name in ("comparison", "collisions")
+    )
+    assert comparison.count("3 of 150") == 2
+    assert maps.count("50 to 100 safe starts per type") == 2
+    assert maps.count("rate") == 1
+
+
+@pytest.mark.parametrize(
+    ("collisions", "starts", "label"), [(0, 9, "0"), (1, 10_000, "<0.1"), (1, 1000, "0.1"), (1, 2, "50"), (0, 0, "n/a")]
+)
+def test_a_cell_never_rounds_a_collision_away(collisions, starts, label):
+    (cell,) = heat_cells([TypeResult((1.0, 1.0), True, collisions, starts, None, None, None)])
+    assert cell["label"] == label
+
+
 def kernel(condition, rank=8):
     return {"rows": 8, "cutoff": 1e-12, "rank": rank, "condition": condition, "effective_rank": 2.0, "curve": []}
 
@@ -75,3 +101,14 @@ def test_ratios_of_condition_numbers_are_bounds_where_a_kernel_is_cut_off(tmp_pa
     assert cells["kernel"] == "J J'"
     assert cells.get("tanh / sin", "n/a") == ratio
     assert cells["tanh / relu"] != "n/a"
+
+
+def test_kernels_of_different_points_or_runs_are_lines_of_their_own(tmp_path):
+    kernels = [("0", "tanh", 600.0, 4), ("1", "sin", 200.0, 40), ("2", "sin", 300.0, 4), ("3", "sin", 100.0, 4)]
+    for name, activation, condition, points in kernels:
+        section = [{"theta": [1.0, 1.0], "points": points, "kernel": kernel(condition), "product": None}]
+        write_run(tmp_path / name, results(activation, ntk=section), extras=False)
+    table = condition_table(load(tmp_path).runs)
+    lines = [dict(zip(table.columns, (cell.text for cell in line.cells), strict=True)) for line in table.rows]
+    shown = [[line[name] for name in ("points", "run", "tanh", "sin", "tanh / sin")] for line in lines]
+    assert shown == [["4", "2", "600", "300", "2"], ["4", "3", "600", "100", "6"], ["40", "", "n/a", "200", "n/a"]]

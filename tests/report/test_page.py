@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 from hno.report import payload
+from hno.report.further import SECTIONS, sections
 from hno.report.page import LIMIT, embedded, render, write_page
 from hno.report.parsing import episode
 from hno.report.runs import load
-from hno.report.tables import SECTIONS, sections
 from tests.report.folders import GRID5, GRID9, make_episode, make_results, row, write_run, write_sweep
 
 HOSTILE = """</script><script>alert(1)</script><img src=x onerror=alert(1)>"'&{{ 7*7 }}<!--\u2028"""
@@ -67,6 +67,10 @@ def test_every_job_is_accounted_for(small_page):
     assert "20 runs: 18 finished, 1 failed, 1 unfinished" in text
     assert "DivergedError: the loss is not finite at step 350." in text
     assert "16 not begun" in text
+
+
+def test_the_excess_cost_is_explained_as_it_is_taken(small_page):
+    assert "Excess cost: median over types of (median joint cost above" in html.unescape(small_page)
 
 
 def test_controls_have_names(small_page):
@@ -158,7 +162,7 @@ def test_no_safe_start_is_no_zero(tmp_path):
     write_run(tmp_path, results, extras=False)
     text = render(load(tmp_path))
     assert "the collision rate is n/a" in text
-    assert Page(text).data["maps"]["r0"] == [[[1.0, 1.0], 0, 0, 1, None]]
+    assert Page(text).data["maps"]["r0"] == [[[1.0, 1.0], 0, 0, 1, None, 0]]
 
 
 def test_types_that_are_not_pairs_have_numbers_and_no_map(tmp_path):
@@ -182,6 +186,44 @@ def test_sections_of_an_evaluation_are_tables(tmp_path, section, nested):
         assert "50.00 %" in [cell.text for cell in table.rows[0].cells]
     text = render(load(tmp_path))
     assert all(heading in text for heading in SECTIONS.values())
+
+
+def residual(theta: tuple[float, ...], region: str, **entries: Any) -> dict[str, Any]:
+    return {
+        "theta": list(theta),
+        "region": region,
+        "seen": False,
+        "points": 100,
+        "physical": 1.0,
+        "scaled": 0.1,
+    } | entries
+
+
+def test_residuals_are_folded_by_region_and_weighted_by_points(tmp_path):
+    rows = [
+        residual((1.0, 1.0), "near", points=300, physical=2.0),
+        residual((1.0, 2.0), "near", physical=6.0),
+        residual((1.0, 3.0), "near", points=0, physical=None),
+        residual((5.0, 5.0), "near", seen=True),
+        residual((1.0, 1.0), "far"),
+    ]
+    results = make_results("drone", "sno", "tanh", 0, np.random.default_rng(0), GRID5[:1]) | {"residuals": rows}
+    (run,) = load(write_run(tmp_path, results, extras=False)).runs
+    table = sections(run)[SECTIONS["residuals"]]
+    assert [[cell.text for cell in line.cells[:4]] for line in table.rows] == [
+        ["near", "3 unseen", "400", "3"], ["near", "1 seen", "100", "1"], ["far", "1 unseen", "100", "1"],
+    ]  # fmt: skip
+
+
+def test_forty_large_evaluations_fit_and_say_what_is_left_out(tmp_path):
+    rows = [{"name": f"{k} <&> {k}", **{f"number {c}": k / 7 for c in range(12)}} for k in range(405)]
+    results = make_results("drone", "sno", "tanh", 0, np.random.default_rng(0), GRID9)
+    for seed in range(40):
+        write_run(tmp_path / str(seed), results | {"seed": seed, "robustness": rows}, episode_types=3)
+    text = render(load(tmp_path))
+    assert len(text.encode()) <= LIMIT
+    assert "200 of 405 rows" in text
+    assert re.search(r"Evaluations of \d+ of 40 runs", text)
 
 
 def test_a_watched_page_says_so_and_others_do_not(small_sweep, small_page):

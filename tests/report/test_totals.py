@@ -25,6 +25,12 @@ def test_types_without_safe_starts_count_for_nothing() -> None:
     assert totals(table) == totals(table[:1])
 
 
+@pytest.mark.parametrize("name", ["median_excess_cost", "median_label_cost"])
+def test_costs_that_were_not_finite_are_null_and_leave_the_others(name: str) -> None:
+    table = [type_row((1, 1), 0, 9, 1.0, 10.0), type_row((1, 2), 0, 9) | {name: None}]
+    assert totals(table).excess == pytest.approx(0.1)
+
+
 @pytest.mark.parametrize("table", [[], [type_row((5, 5), 0, 0)]])
 def test_what_does_not_exist_is_none(table: list[dict[str, object]]) -> None:
     assert totals(table) == (0, 0, None, None, None, None, None)

@@ -55,16 +55,19 @@ function drawHeat(host) {
   draw(host, "heat", { cells: rows }, { x_step: step, y_step: step });
 }
 
+const inPercent = (rate) => (rate < 0.0005 ? "<0.1" : (100 * rate).toFixed(rate < 0.0995 ? 1 : 0));
+
 function heatCell(cell, a, b, which, step) {
   const names = { theta_1: a, theta_2: b };
   if (!cell) return { ...names, shown: undefined, label: "", seen: false, tip: `types ${types([a, b])}\nnot evaluated` };
-  const [theta, hits, starts, seen, excess] = cell;
+  const [theta, hits, starts, seen, excess, extrapolated] = cell;
   const bounds = DATA.intervals[`${hits}/${starts}`];
   const rate = starts ? hits / starts : null;
   const shown = which === "rate" || !bounds ? rate : bounds[1];
-  const label = shown === null ? "–" : shown === 0 ? "0" : step < 20 ? "" : (100 * shown).toFixed(shown < 0.0995 ? 1 : 0);
+  const label = shown === null ? "–" : shown === 0 ? "0" : step < 20 ? "" : inPercent(shown);
   const tip = [
     `types ${types(theta)}, ${seen ? "seen in training" : "without training labels"}`,
+    extrapolated ? "outside the type box: extrapolated" : "",
     starts ? `${hits} of ${starts} safe starts collide: ${percent(rate)}` : "no safe start: rate n/a",
     bounds ? `95 % interval ${percent(bounds[0])} to ${percent(bounds[1])}` : "",
     excess === null ? "" : `median excess cost ${excess < 0 ? "" : "+"}${(100 * excess).toFixed(1)} %`,

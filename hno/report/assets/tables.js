@@ -30,10 +30,10 @@ for (const details of all("details[data-numbers]")) {
   details.addEventListener("toggle", () => {
     if (details.querySelector("table")) return;
     const head = element("tr", {}, ...["θ", "collide", "rate", "95 %"].map((text) => element("th", { scope: "col", textContent: text })));
-    const rows = DATA.maps[details.dataset.numbers].map(([theta, hits, starts, seen]) => {
+    const rows = DATA.maps[details.dataset.numbers].map(([theta, hits, starts, seen, , extrapolated]) => {
       const bounds = DATA.intervals[`${hits}/${starts}`];
       const texts = [
-        `${types(theta)}${seen ? " seen" : ""}`, `${hits} of ${starts}`, percent(starts ? hits / starts : null),
+        `${types(theta)}${seen ? " seen" : ""}${extrapolated ? " extrapolated" : ""}`, `${hits} of ${starts}`, percent(starts ? hits / starts : null),
         bounds ? `${percent(bounds[0])} to ${percent(bounds[1])}` : "n/a",
       ];
       return element("tr", {}, ...texts.map((text) => element("td", { textContent: text })));
