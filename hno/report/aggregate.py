@@ -125,9 +125,15 @@ def total(rows: Iterable[TypeResult]) -> Rate:
 def pool(rows: Sequence[TypeResult]) -> TypeResult:
     """One type over seeds."""
     counted = total(rows)
-    means = (mean(getattr(row, name) for row in rows) for name in ("distance", "excess", "label_cost"))
-    extrapolated = any(row.extrapolated for row in rows)
-    return TypeResult(rows[0].theta, any(row.seen for row in rows), *counted, *means, extrapolated)
+    return TypeResult(
+        rows[0].theta,
+        any(row.seen for row in rows),
+        *counted,
+        distance=mean(row.distance for row in rows),
+        excess=mean(row.excess for row in rows),
+        label_cost=mean(row.label_cost for row in rows),
+        extrapolated=any(row.extrapolated for row in rows),
+    )
 
 
 def mean(values: Iterable[float | None]) -> float | None:

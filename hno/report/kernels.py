@@ -56,7 +56,9 @@ def condition_table(runs: Sequence[Run]) -> Table:
 def _lines(found: Mapping[str, Sequence[tuple[str, Summary]]]) -> list[Line]:
     single = {name: entries[0][1] for name, entries in found.items() if len(entries) == 1}
     several = {name: entries for name, entries in found.items() if len(entries) > 1}
-    lines = [(run, {**single, name: spectrum}) for name, entries in several.items() for run, spectrum in entries]
+    lines: list[Line] = [
+        (run, {**single, name: spectrum}) for name, entries in several.items() for run, spectrum in entries
+    ]
     return lines or [("", single)]
 
 

@@ -98,7 +98,14 @@ def test_hash_names_what_determines_the_numbers() -> None:
     assert config_hash(composed()) == base
     for same in ("logger=csv", "resume=/some/last.ckpt", "data.cache=/some", "data.workers=1", "trainer.threads=1"):
         assert config_hash(composed(same)) == base
-    for other in ("seed=1", "game=drone", "operator=hno", "activation=tanh", "optimizer.lr=1e-4", "data.trajectories=8"):
+    for other in (
+        "seed=1",
+        "game=drone",
+        "operator=hno",
+        "activation=tanh",
+        "optimizer.lr=1e-4",
+        "data.trajectories=8",
+    ):
         assert config_hash(composed(other)) != base
 
 
