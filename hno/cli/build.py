@@ -27,7 +27,7 @@ SIZES = (
 """Entries that must be whole and positive where they are set."""
 FLAGS = (
     "operator.exact_terminal", "loss.scaled", "loss.balance", "trainer.compile", "validation.stop_when_safe",
-    "evaluation.safe",
+    "evaluation.safe", "evaluation.ntk",
 )  # fmt: skip
 """Entries that are true or false."""
 

@@ -22,10 +22,15 @@ KINDS = {"kernel": "J J'", "product": "paper's product"}
 
 def check_ntk(operator: ValueOperator, types: Iterable[tuple[float, ...]], settings: DictConfig) -> None:
     """Raise ValueError for entries from which no kernel can be made."""
-    whole_number("ntk_rows", settings.ntk_rows, rows_per_point(operator), "the rows of one point")
+    check_rows(operator, settings)
     if not set(types) & set(operator.seen_types):
         seen = "; ".join(",".join(f"{t:g}" for t in theta) for theta in operator.seen_types) or "none"
         raise ValueError(f'ntk=true needs a type of the training run among theta; these are "{seen}".')
+
+
+def check_rows(operator: ValueOperator, settings: DictConfig) -> None:
+    """Raise ValueError unless the kernel has rows for at least one point."""
+    whole_number("ntk_rows", settings.ntk_rows, rows_per_point(operator), "the rows of one point")
 
 
 def ntk_section(operator: ValueOperator, labels: Sequence[Extremal], settings: DictConfig) -> list[dict[str, Any]]:

@@ -20,6 +20,7 @@ from hno.cli.config import run_command
 from hno.cli.evaluate import check_evaluation, evaluate_policy, solve_tests
 from hno.cli.logs import finish_wandb, label_progress, send_lightning_to_hydra
 from hno.cli.media import publish
+from hno.cli.ntk import check_rows, ntk_section
 from hno.cli.results import Results, config_hash, plain
 from hno.cli.summary import report, show
 from hno.data import GameData
@@ -87,11 +88,17 @@ def _run(config: DictConfig, folder: Path, results: Results) -> None:
     game = build_game(config)
     check_evaluation(game, settings)
     unseen = game.validate_types(settings.types)
+    if settings.ntk:
+        check_rows(build_operator(config, game), settings)
     trainer = fit(config, folder, results)
     policy = load_policy(folder / results.content["checkpoint"])
     types = list(dict.fromkeys([*policy.operator.seen_types, *unseen]))
     test = solve_tests(game, types, settings, cache_folder(config.data.cache), config.data.workers, results)
     evaluate_policy(policy, test, settings, results)
+    if settings.ntk:
+        began = time.perf_counter()
+        results.update(ntk=ntk_section(policy.operator, test, settings))
+        results.time("ntk", time.perf_counter() - began)
     results.update(status="finished")
     publish(trainer.loggers, results.content, folder, trainer.global_step)
 

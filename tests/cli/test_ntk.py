@@ -11,7 +11,7 @@ from hno.evaluation.spectrum import spectrum, summary
 from hno.games import make
 from hno.operators import operators
 from hno.types import Status
-from tests.cli.conftest import Command, refused
+from tests.cli.conftest import SMOKE, Command, refused
 from tests.fakes import fake_labels
 
 FAST = ("workers=1", "starts=4", "dt=0.1")
@@ -33,6 +33,19 @@ def test_the_kernel_at_training_types_is_in_the_results(command: Command, random
         assert 1 <= found["effective_rank"] <= found["rank"] <= 60
     assert "Neural tangent kernel" in run.text
     assert "paper's product" in run.text
+
+
+def test_training_can_end_with_the_kernel(command: Command) -> None:
+    run = command("train", *SMOKE, "trainer.max_steps=1", "evaluation.ntk=true", "evaluation.ntk_rows=40")
+    assert run.code == 0, run.text
+    assert [(entry["theta"], entry["kernel"]["rows"]) for entry in run.results["ntk"]] == [([1, 1], 40)]
+    assert "Neural tangent kernel" in run.text
+
+
+@pytest.mark.usefixtures("no_labels")
+@pytest.mark.parametrize("override", ["evaluation.ntk_rows=19", "evaluation.ntk=maybe"])
+def test_a_training_that_cannot_is_refused_before_it_begins(command: Command, override: str) -> None:
+    refused(command("train", *SMOKE, "evaluation.ntk=true", override), "must be")
 
 
 def test_no_kernel_unless_asked_for(command: Command, random_checkpoint: Path) -> None:
