@@ -11,11 +11,11 @@ from typing import Any
 
 from lightning.pytorch.loggers import Logger, TensorBoardLogger, WandbLogger
 
-from hno.cli.tables import number
 from hno.report.collision_map import collision_map
 from hno.report.gif import animate
 from hno.report.picture import PlotsMissingError
 from hno.report.totals import totals
+from hno.report.words import number
 
 log = logging.getLogger(__name__)
 
@@ -102,8 +102,9 @@ def _clearance(episode: Mapping[str, Any]) -> float:
 
 def _send_to_wandb(logger: WandbLogger, results: Mapping[str, Any], pictures: Mapping[str, Path], step: int) -> None:
     logger.log_metrics(numbers(results), step)
-    worst = totals(results["table"]).worst_theta
-    logger.experiment.summary["test/worst_theta"] = "n/a" if worst is None else name_of(worst)
+    whole = totals(results["table"])
+    worst = "n/a" if whole.worst_theta is None else (name_of(whole.worst_theta) if whole.collisions else "none")
+    logger.experiment.summary["test/worst_theta"] = worst
     for name, path in pictures.items():
         send = logger.log_video if path.suffix == ".gif" else logger.log_image
         send(name, [str(path)], step)

@@ -11,11 +11,12 @@ from rich.console import Console
 from rich.table import Table
 
 from hno.cli.checks import whole_number
-from hno.cli.tables import interval, number, percent, types
+from hno.cli.tables import types
 from hno.evaluation.receding_horizon import RecedingHorizon
 from hno.evaluation.rollout import Disturbance
 from hno.evaluation.yardstick import compare, latency, safe_starts
 from hno.operators.checkpoint import OperatorPolicy
+from hno.report.words import interval, number, percent
 from hno.types import Extremal
 
 log = logging.getLogger(__name__)

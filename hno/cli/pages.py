@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 from pathlib import Path
 
-from hno.report.runs import NoRunsError, load
+from hno.report.runs import load
 
 PAGE = "report.html"
 
@@ -14,7 +14,7 @@ def write(folder: Path) -> str:
     """Write the page of a run or of a sweep into its folder.
 
     Returns:
-        A line that says where it lies, or what to do where it could not be written.
+        A line that says where it lies, or why it could not be written: that costs no run its results.
     """
     again = f"python -m hno.report {shlex.quote(str(folder))}"
     try:
@@ -23,6 +23,6 @@ def write(folder: Path) -> str:
         write_page(load(folder), folder / PAGE)
     except ModuleNotFoundError as error:
         return f"Page: needs the package {error.name}: pip install 'hno[report]', then {again}"
-    except (NoRunsError, OSError) as error:
-        return f"Page: could not be written ({error}). Later: {again}"
+    except Exception as error:
+        return f"Page: could not be written ({type(error).__name__}: {error}). Later: {again}"
     return f"Page: {folder / PAGE}"

@@ -15,9 +15,10 @@ from rich.table import Table
 
 import hno
 from hno.cli.sections import SECTIONS
-from hno.cli.tables import interval, number, percent, short_names, show_comparison, types
+from hno.cli.tables import short_names, show_comparison, types
 from hno.registry import UnknownNameError
 from hno.report.totals import totals
+from hno.report.words import interval, number, percent
 
 log = logging.getLogger(__name__)
 

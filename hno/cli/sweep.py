@@ -14,8 +14,9 @@ from rich.console import Console
 from rich.table import Table
 
 from hno.cli import pages
-from hno.cli.tables import percent
+from hno.cli.tables import types
 from hno.report.totals import totals
+from hno.report.words import interval, percent, signed
 
 NAMES = ("game", "operator", "activation", "seed")
 """Entries of results.json that name a job, in the order by which jobs are sorted."""
@@ -97,13 +98,12 @@ def _names(found: Mapping[str, Any]) -> list[str]:
 def _cells(found: Mapping[str, Any]) -> list[str]:
     whole = totals(found.get("table", ()))
     spent = found.get("seconds", {}).values()
-    interval, excess = whole.interval, whole.excess
-    at = f" at {', '.join(f'{t:g}' for t in whole.worst_theta)}" if whole.worst_theta and whole.collisions else ""
+    at = f" at {types(whole.worst_theta)}" if whole.worst_theta and whole.collisions else ""
     return [
         f"{whole.collisions} of {whole.safe_starts}" if whole.safe_starts else "n/a",
-        "n/a" if interval is None else f"{100 * interval[0]:.2f} to {100 * interval[1]:.2f} %",
+        interval(whole.interval),
         percent(whole.worst_rate) + at,
-        "n/a" if excess is None else f"{100 * excess:+.1f} %",
+        signed(whole.excess),
         f"{sum(spent):.0f}" if spent else "n/a",
         str(found["status"]),
     ]

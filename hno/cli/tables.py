@@ -11,22 +11,9 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from hno.report.words import interval, number, percent
+
 Row = Mapping[str, Any]
-
-
-def percent(rate: float | None, digits: int = 2) -> str:
-    """A rate for people; "n/a" when there was nothing to count."""
-    return "n/a" if rate is None else f"{100 * rate:.{digits}f} %"
-
-
-def number(value: float | None) -> str:
-    """A number for people; "n/a" when there is none."""
-    return "n/a" if value is None else f"{value:.2f}"
-
-
-def interval(ends: Sequence[float] | None) -> str:
-    """An interval of rates for people."""
-    return "n/a" if ends is None else f"{100 * ends[0]:.2f} to {100 * ends[1]:.2f} %"
 
 
 def types(theta: Iterable[float]) -> str:

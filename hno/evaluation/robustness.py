@@ -10,7 +10,7 @@ import torch
 
 from hno.evaluation.closed_loop import classify, collided, excess_costs, median, play
 from hno.evaluation.disturbance import pushed_states
-from hno.evaluation.metrics import CollisionRate, clopper_pearson
+from hno.evaluation.metrics import clopper_pearson
 from hno.evaluation.rollout import Disturbance, Policy
 from hno.games import Game
 from hno.registry import unknown_name
@@ -117,15 +117,14 @@ def robustness_table(
 def _row(
     game: Game, policy: Policy, condition: Condition, labels: Sequence[Extremal], clearance: float, dt: float
 ) -> ConditionRow:
-    total, types, excess, costs = CollisionRate(), [], [], []
+    types, excess, costs = list[dict[str, Any]](), [], []
     for found, played in zip(labels, play(game, policy, labels, dt, condition.disturbance), strict=True):
         safe, _ = classify(found, clearance)
-        total.update(played.clearance, safe)
         excess.append(excess_costs(found, played).sum(-1)[safe])
         costs.append(-found.value[:, 0].sum(-1)[safe])
         counts = {"safe_starts": int(safe.sum()), "collisions": int((collided(played) & safe).sum())}
         types.append({"theta": tuple(found.theta[0].tolist()), **counts})
-    collisions, counted = int(total.collisions), int(total.episodes)
+    collisions, counted = (sum(row[name] for row in types) for name in ("collisions", "safe_starts"))
     undisturbed = Disturbance(seed=condition.disturbance.seed)._asdict()
     return ConditionRow(
         name=condition.name,

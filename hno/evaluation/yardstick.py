@@ -10,12 +10,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from hno.evaluation.closed_loop import classify, median
+from hno.evaluation.closed_loop import classify, collided, excess_costs, median
 from hno.evaluation.metrics import clopper_pearson
 from hno.evaluation.receding_horizon import RecedingHorizon
 from hno.evaluation.rollout import Disturbance, Policy, rollout
 from hno.games import Game
-from hno.types import Extremal, Trajectory, part
+from hno.types import Extremal, Trajectory, join, part
 
 
 class Driven(NamedTuple):
@@ -110,13 +110,13 @@ def compare(
         One line per type, and a last one for all of them.
     """
     starts, theta = _starts(labels)
-    label_cost = torch.cat([-found.value[:, 0].sum(-1) for found in labels])
+    label = join(labels)
     solver = RecedingHorizon(game, interval)
     played, solved = (rollout(game, p, starts, theta, dt, disturbance=disturbance) for p in (policy, solver))
     rows = torch.arange(len(starts)).split([len(found.status) for found in labels])
     names: list[tuple[float, ...] | None] = [*(tuple(map(float, t)) for t in types), None]
     return [
-        Beside(t, driven(played, label_cost, index), driven(solved, label_cost, index), _solves(solver, index))
+        Beside(t, driven(played, label, index), driven(solved, label, index), _solves(solver, index))
         for t, index in zip(names, [*rows, torch.arange(len(starts))], strict=True)
     ]
 
@@ -125,10 +125,10 @@ def _starts(labels: Sequence[Extremal]) -> tuple[Tensor, Tensor]:
     return (torch.cat([found.x[:, 0] for found in labels]).float(), torch.cat([f.theta for f in labels]).float())
 
 
-def driven(played: Trajectory, label_cost: Tensor, rows: Tensor) -> Driven:
-    """Some of the episodes in numbers, compared with their labels' joint cost (B,)."""
-    collisions = int((~(played.clearance[rows] > 0)).sum())
-    excess = (-played.value.sum(-1).double() - label_cost)[rows]
+def driven(played: Trajectory, label: Extremal, rows: Tensor) -> Driven:
+    """Some of the episodes in numbers, compared with the labels from the same starts."""
+    collisions = int(collided(played)[rows].sum())
+    excess = excess_costs(label, played).sum(-1)[rows]
     some = len(rows) > 0
     return Driven(
         starts=len(rows),

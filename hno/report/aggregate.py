@@ -1,12 +1,11 @@
-"""Runs of one recipe with several seeds as one line: pooled counts, and the spread over seeds."""
+"""Runs of one recipe with several seeds as one line: pooled counts, the spread over seeds, and the best of a game."""
 
 from __future__ import annotations
 
 import functools
 import math
-import statistics
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 from scipy.stats import t as student
@@ -14,13 +13,10 @@ from scipy.stats import t as student
 from hno.evaluation.metrics import clopper_pearson
 from hno.report.parsing import TypeResult, number
 from hno.report.runs import NOT_AVAILABLE, Run
+from hno.report.totals import relative_excess
 
 CONFIDENCE = 0.95
 """Of every interval."""
-IGNORED = ("seed", "resume", "cache", "workers", "data.cache", "data.workers", "trainer.print_every", "trainer.threads")
-"""Settings that do not make another recipe."""
-SHOWN = 3
-"""Differing settings that are named in a recipe's label."""
 
 
 class Rate(NamedTuple):
@@ -57,7 +53,7 @@ class Spread(NamedTuple):
 
 
 Comparable = tuple[str, str, frozenset[tuple[float, ...]]]
-"""Game, conditions and types."""
+"""Game, what is special, and types."""
 
 
 class Recipe(NamedTuple):
@@ -68,8 +64,8 @@ class Recipe(NamedTuple):
     activation: str
     variant: str
     """Settings in which it differs from others of the same names; empty if there are none."""
-    conditions: str
-    """Changed constants of the game, how episodes were played, and at how many types."""
+    special: str
+    """Changed constants of the game and how episodes were played, as far as that is not usual; empty if it is."""
     runs: tuple[Run, ...]
     """One finished run for every seed."""
     repeated: tuple[Run, ...]
@@ -83,9 +79,16 @@ class Recipe(NamedTuple):
         return " / ".join(filter(None, (self.operator, self.activation, self.variant)))
 
     @property
+    def conditions(self) -> str:
+        """At how many types episodes were played, and what was special."""
+        sizes = sorted({len(run.table) for run in self.runs})
+        at = f"{' or '.join(map(str, sizes))} types" if sizes else NOT_AVAILABLE
+        return ", ".join(filter(None, (at, self.special)))
+
+    @property
     def comparable(self) -> Comparable:
         """What recipes share whose numbers may be compared: the game with its constants, play, and the very types."""
-        return self.game, self.conditions, frozenset(row.theta for run in self.runs for row in run.table)
+        return self.game, self.special, frozenset(row.theta for run in self.runs for row in run.table)
 
     @property
     def rate(self) -> Rate:
@@ -144,9 +147,7 @@ def mean(values: Iterable[float | None]) -> float | None:
 
 def excess(rows: Iterable[TypeResult]) -> float | None:
     """Median over types of the median excess cost, relative to the median of the equilibria's costs."""
-    known = [(row.excess, row.label_cost) for row in rows if row.excess is not None]
-    ratios = [above / abs(cost) for above, cost in known if cost]
-    return statistics.median(ratios) if ratios else None
+    return relative_excess((row.excess, row.label_cost) for row in rows)
 
 
 def worst(rows: Iterable[TypeResult]) -> TypeResult | None:
@@ -177,64 +178,6 @@ def seconds(run: Run, part: str) -> float | None:
     return (math.fsum(known) if known else None) if part == "total" else number(parts.get(part))
 
 
-def recipes(runs: Sequence[Run]) -> list[Recipe]:
-    """Group runs whose settings are equal but for the seed."""
-    groups: dict[tuple[str, ...], dict[tuple[tuple[str, str], ...], list[Run]]] = {}
-    for run in runs:
-        names = (run.game, run.operator, run.activation)
-        groups.setdefault(names, {}).setdefault(tuple(sorted(relevant(run).items())), []).append(run)
-    return [
-        _recipe(names, variant, same)
-        for names, group in sorted(groups.items())
-        for variant, same in zip(_variants([dict(key) for key in group]), group.values(), strict=True)
-    ]
-
-
-def relevant(run: Run) -> dict[str, str]:
-    """The settings that make a recipe; without a configuration, what the results say."""
-    chosen = {key: text for key, text in run.settings.items() if key not in IGNORED and not key.startswith("logger.")}
-    return chosen or {"steps": str(run.content.get("steps", NOT_AVAILABLE)), "conditions": run.conditions}
-
-
-def _variants(settings: Sequence[Mapping[str, str]]) -> list[str]:
-    """What tells each of some settings from the others."""
-    keys = sorted({key for one in settings for key in one})
-    differing = [key for key in keys if len({one.get(key) for one in settings}) > 1]
-    more = [f"{len(differing) - SHOWN} more"] if len(differing) > SHOWN else []
-    return [", ".join([f"{key}={_short(one.get(key))}" for key in differing[:SHOWN]] + more) for one in settings]
-
-
-def _short(text: str | None) -> str:
-    """A setting for a label: of a path its last three parts, of anything else the beginning."""
-    if text is None:
-        return NOT_AVAILABLE
-    return "/".join(text.split("/")[-3:]) if "/" in text else text[:40]
-
-
-def _recipe(names: tuple[str, ...], variant: str, runs: Sequence[Run]) -> Recipe:
-    last: dict[object, Run] = {}
-    for run in runs:
-        if run.finished:
-            last[run.seed, run.content.get("test_seed")] = run
-    counted = tuple(last.values())
-    repeated = tuple(run for run in runs if run.finished and all(run is not other for other in counted))
-    failed = sum(run.status == "failed" for run in runs)
-    unfinished = len(runs) - len(counted) - len(repeated) - failed
-    sizes = sorted({len(run.table) for run in counted})
-    conditions = ", ".join(sorted({text for run in counted for text in (_constants(run), run.conditions)} - {""}))
-    at = f"{' or '.join(map(str, sizes))} types" if sizes else NOT_AVAILABLE
-    game, operator, activation = names
-    return Recipe(
-        game, operator, activation, variant, ", ".join(filter(None, (at, conditions))), counted, repeated, unfinished,
-        failed,
-    )  # fmt: skip
-
-
-def _constants(run: Run) -> str:
-    changed = {key: text for key, text in sorted(run.settings.items()) if key.startswith("game.constants.")}
-    return ", ".join(f"{key.removeprefix('game.constants.')} {text}" for key, text in changed.items())
-
-
 def best(found: Iterable[Recipe]) -> dict[Comparable, Recipe]:
     """The recipe with the lowest collision rate, then the lowest excess cost, of all that may be compared."""
     first: dict[Comparable, Recipe] = {}
@@ -251,7 +194,7 @@ def _order(recipe: Recipe) -> tuple[float, float]:
 
 def headline(found: Iterable[Recipe]) -> Recipe:
     """Of the best recipes of a game the one at its usual constants and conditions, then at the most types."""
-    return min(found, key=lambda one: ("," in one.conditions, -len(one.comparable[2]), *_order(one)))
+    return min(found, key=lambda one: (bool(one.special), -len(one.comparable[2]), *_order(one)))
 
 
 def rivals(chosen: Recipe, found: Iterable[Recipe]) -> list[Recipe]:

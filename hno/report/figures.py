@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from hno.data.store import replace_whole
 from hno.report import charts, payload, words
-from hno.report.aggregate import Rate, Recipe, best, headline, recipes
+from hno.report.aggregate import Rate, Recipe, best, headline
+from hno.report.grouping import recipes
 from hno.report.kernels import condition_table
 from hno.report.palette import LIGHT, chart_config
 from hno.report.parsing import Episode, TypeResult

@@ -13,9 +13,10 @@ from markupsafe import Markup
 
 from hno.data.store import replace_whole
 from hno.report import payload, words
-from hno.report.aggregate import Recipe, best, headline, recipes, total, worst
+from hno.report.aggregate import Recipe, best, headline, total, worst
 from hno.report.charts import library, specifications
 from hno.report.further import fitting, further
+from hno.report.grouping import recipes
 from hno.report.palette import DARK, FONT, LIGHT, Palette, chart_config, signals
 from hno.report.runs import NOT_AVAILABLE, Run, Sweep
 from hno.report.tables import CACHED, generic, label_tables, names_of, recipe_table, run_table
@@ -77,7 +78,6 @@ def _content(sweep: Sweep, refresh: float | None) -> tuple[dict[str, Any], dict[
     tables = [(card["id"], card.pop("table")) for card in cards]
     maps = payload.maps(tables)
     curves = payload.learning_curves(sweep.runs, {run.name: recipe.name for recipe in found for run in recipe.runs})
-    common, differing = _settings(sweep.runs, found)
     data = {
         "maps": maps,
         "intervals": payload.intervals(rows for name, rows in tables if name in maps),
@@ -90,28 +90,12 @@ def _content(sweep: Sweep, refresh: float | None) -> tuple[dict[str, Any], dict[
         "refresh": refresh,
     }
     content = {
-        "name": sweep.name,
-        "jobs": words.jobs(sweep),
-        "games": _games(found),
-        "filters": {name: _choices(sweep.runs, name) for name in ("game", "operator", "activation", "seed")},
+        **_results(sweep, found),
+        **_origin(sweep, found),
         "cards": [card for card in cards if card["id"] in maps],
         "cards_total": len(cards),
-        "cached": CACHED,
-        "recipe_table": recipe_table(found),
-        "run_table": run_table(sweep.runs),
-        "problems": [(run.name, run.status, words.why(run)[:600]) for run in sweep.runs if not run.finished],
-        "skipped": sweep.skipped,
-        "notes": [(run.name, note) for run in sweep.runs for note in run.notes],
-        "repeated": [run.name for recipe in found for run in recipe.repeated],
         "curves": curves,
         "curve_games": sorted({entry["game"] for entry in curves.content}),
-        "compared_games": sorted({recipe.game for recipe in found if recipe.rate.starts}),
-        "labels": label_tables(sweep.runs),
-        "common": common,
-        "differing": differing,
-        "versions": _versions(sweep.runs),
-        "command": sweep.command,
-        "commands": [(run.name, run.command or f"{NOT_AVAILABLE}: no .hydra/overrides.yaml") for run in sweep.runs],
         "refresh": refresh,
         "variables": {"light": _variables(LIGHT), "dark": _variables(DARK)},
         "style": Markup(_asset("page.css")),
@@ -119,6 +103,37 @@ def _content(sweep: Sweep, refresh: float | None) -> tuple[dict[str, Any], dict[
         "script": Markup(_script("\n".join(_asset(name) for name in SCRIPTS))),
     }
     return content, data
+
+
+def _results(sweep: Sweep, found: Sequence[Recipe]) -> dict[str, Any]:
+    """What came of the runs, and which of them say nothing."""
+    return {
+        "name": sweep.name,
+        "jobs": words.jobs(sweep),
+        "games": _games(found),
+        "filters": {name: _choices(sweep.runs, name) for name in ("game", "operator", "activation", "seed")},
+        "cached": CACHED,
+        "recipe_table": recipe_table(found),
+        "run_table": run_table(sweep.runs),
+        "problems": [(run.name, run.status, words.why(run)[:600]) for run in sweep.runs if not run.finished],
+        "skipped": sweep.skipped,
+        "notes": [(run.name, note) for run in sweep.runs for note in run.notes],
+        "repeated": [run.name for recipe in found for run in recipe.repeated],
+        "compared_games": sorted({recipe.game for recipe in found if recipe.rate.starts}),
+        "labels": label_tables(sweep.runs),
+    }
+
+
+def _origin(sweep: Sweep, found: Sequence[Recipe]) -> dict[str, Any]:
+    """Settings, versions and command lines."""
+    common, differing = _settings(sweep.runs, found)
+    return {
+        "common": common,
+        "differing": differing,
+        "versions": _versions(sweep.runs),
+        "command": sweep.command,
+        "commands": [(run.name, run.command or f"{NOT_AVAILABLE}: no .hydra/overrides.yaml") for run in sweep.runs],
+    }
 
 
 def _asset(name: str) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from hno.evaluation.metrics import clopper_pearson
@@ -33,8 +33,6 @@ def totals(table: Sequence[Mapping[str, Any]]) -> Totals:
     collisions, safe = (sum(row[name] for row in table) for name in ("collisions", "safe_starts"))
     counted = [row for row in table if row["rate"] is not None]
     worst = max(counted, key=lambda row: row["rate"], default=None)
-    costs = [(row["median_excess_cost"], row["median_label_cost"]) for row in counted]
-    ratios = [above / abs(cost) for above, cost in costs if above is not None and cost]
     return Totals(
         collisions=collisions,
         safe_starts=safe,
@@ -42,5 +40,11 @@ def totals(table: Sequence[Mapping[str, Any]]) -> Totals:
         interval=clopper_pearson(collisions, safe),
         worst_theta=None if worst is None else tuple(worst["theta"]),
         worst_rate=None if worst is None else worst["rate"],
-        excess=statistics.median(ratios) if ratios else None,
+        excess=relative_excess((row["median_excess_cost"], row["median_label_cost"]) for row in counted),
     )
+
+
+def relative_excess(costs: Iterable[tuple[float | None, float | None]]) -> float | None:
+    """Median over types of (cost above the equilibrium's) / (the equilibrium's); None where no type has both."""
+    ratios = [above / abs(cost) for above, cost in costs if above is not None and cost]
+    return statistics.median(ratios) if ratios else None

@@ -57,16 +57,24 @@ def test_both_controllers_play_the_same_starts_and_the_solver_avoids_the_other()
         assert row.solver.median_excess_cost < row.policy.median_excess_cost
 
 
+def costing(cost: Tensor) -> Extremal:
+    """Labels with these costs of the players, (B, 2)."""
+    label = fake_labels(Walkers(), count=len(cost))
+    label.value[:, 0] = -cost
+    return label
+
+
 def test_costs_are_compared_with_those_of_the_labels_row_by_row() -> None:
     x0, theta = torch.zeros(4, 2, 2), torch.zeros(4, 2)
     x0[:, :, 1] = torch.tensor([0.0, 0.5, 0.6, 0.7]).unsqueeze(-1)
     played = rollout(Walkers(), straight, x0, theta, 0.1)
-    cost = -played.value.sum(-1).double()
-    found = driven(played, cost - torch.tensor([9.0, 1.0, 5.0, 2.0]), torch.tensor([1, 2, 3]))
+    label = costing(-played.value.double())
+    cheaper = torch.tensor([9.0, 1.0, 5.0, 2.0])
+    found = driven(played, costing(-played.value.double() - cheaper[:, None] / 2), torch.tensor([1, 2, 3]))
     assert (found.starts, found.collisions) == (3, 0)
     assert found.median_excess_cost == pytest.approx(2)
     assert found.largest_excess_cost == pytest.approx(5)
-    assert driven(played, cost, torch.arange(4)).collisions == 1
+    assert driven(played, label, torch.arange(4)).collisions == 1
 
 
 def test_a_broken_policy_is_no_safe_one() -> None:
@@ -74,7 +82,7 @@ def test_a_broken_policy_is_no_safe_one() -> None:
         return torch.full((len(x), 2, 2), torch.nan)
 
     played = rollout(Walkers(), broken, torch.zeros(2, 2, 2), torch.zeros(2, 2), 0.1)
-    assert driven(played, torch.zeros(2), torch.arange(2)).collisions == 2
+    assert driven(played, costing(torch.zeros(2, 2)), torch.arange(2)).collisions == 2
 
 
 class Slow:

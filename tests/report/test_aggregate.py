@@ -12,7 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import beta, t
 
-from hno.report.aggregate import Rate, Recipe, best, excess, headline, pool, recipes, rivals, spread, worst
+from hno.report.aggregate import Rate, Recipe, best, excess, headline, pool, rivals, spread, worst
+from hno.report.grouping import recipes
 from hno.report.parsing import TypeResult, type_result
 from hno.report.payload import heat_map
 from hno.report.runs import Run, load

@@ -8,8 +8,8 @@ import xml.etree.ElementTree as ET
 import numpy as np
 import pytest
 
-from hno.report.aggregate import recipes
 from hno.report.figures import heat_cells, markdown, summary, write_figures
+from hno.report.grouping import recipes
 from hno.report.kernels import condition_table
 from hno.report.parsing import TypeResult
 from hno.report.runs import load
