@@ -103,8 +103,8 @@ def _clearance(episode: Mapping[str, Any]) -> float:
 def _send_to_wandb(logger: WandbLogger, results: Mapping[str, Any], pictures: Mapping[str, Path], step: int) -> None:
     logger.log_metrics(numbers(results), step)
     whole = totals(results["table"])
-    worst = "n/a" if whole.worst_theta is None else (name_of(whole.worst_theta) if whole.collisions else "none")
-    logger.experiment.summary["test/worst_theta"] = worst
+    nobody = "n/a" if whole.rate is None else "none"
+    logger.experiment.summary["test/worst_theta"] = name_of(whole.worst_theta) if whole.worst_theta else nobody
     for name, path in pictures.items():
         send = logger.log_video if path.suffix == ".gif" else logger.log_image
         send(name, [str(path)], step)

@@ -103,10 +103,10 @@ def remarks(table: Sequence[Mapping[str, Any]], clearance: float) -> list[str]:
 def verdict(table: Sequence[Mapping[str, Any]]) -> str:
     """The totals over all types in one sentence."""
     whole = totals(table)
-    if whole.rate is None or whole.worst_theta is None:
+    if whole.rate is None:
         return "No start has a safe equilibrium: there is no collision rate (n/a)."
     total = f"{whole.collisions} collisions in {whole.safe_starts} safe starts ({percent(whole.rate)})"
-    if whole.collisions == 0:
+    if whole.worst_theta is None:
         return f"{total}."
     return f"{total}; worst {percent(whole.worst_rate)} at ({types(whole.worst_theta)})."
 

@@ -98,7 +98,7 @@ def _names(found: Mapping[str, Any]) -> list[str]:
 def _cells(found: Mapping[str, Any]) -> list[str]:
     whole = totals(found.get("table", ()))
     spent = found.get("seconds", {}).values()
-    at = f" at {types(whole.worst_theta)}" if whole.worst_theta and whole.collisions else ""
+    at = f" at {types(whole.worst_theta)}" if whole.worst_theta else ""
     return [
         f"{whole.collisions} of {whole.safe_starts}" if whole.safe_starts else "n/a",
         interval(whole.interval),

@@ -47,8 +47,7 @@ def _chosen(clearance: Tensor, distance: Tensor) -> dict[str, int]:
     """Rows by what they stand for: the smallest clearance (NaN first), and the median of the smallest distances."""
     if len(clearance) == 0:
         return {}
-    worst = clearance.nan_to_num(-math.inf).argmin()
-    return {"worst": int(worst), "typical": int(distance.argsort()[len(distance) // 2])}
+    return {"worst": int(clearance.argmin()), "typical": int(distance.argsort()[len(distance) // 2])}
 
 
 def _episode(game: Game, played: Trajectory, label: Extremal, row: int) -> dict[str, Any]:

@@ -21,9 +21,9 @@ class Totals(NamedTuple):
     interval: tuple[float, float] | None
     """Clopper-Pearson 95 % interval of the rate."""
     worst_theta: tuple[float, ...] | None
-    """The types with the highest rate, the first ones where several share it."""
+    """The types with the highest rate, the first ones where several share it; none where nothing collides."""
     worst_rate: float | None
-    """That rate."""
+    """The highest rate of any types."""
     excess: float | None
     """Median over types of (median joint cost above the equilibrium's) / (median of the equilibrium's)."""
 
@@ -38,7 +38,7 @@ def totals(table: Sequence[Mapping[str, Any]]) -> Totals:
         safe_starts=safe,
         rate=collisions / safe if safe else None,
         interval=clopper_pearson(collisions, safe),
-        worst_theta=None if worst is None else tuple(worst["theta"]),
+        worst_theta=tuple(worst["theta"]) if worst is not None and collisions else None,
         worst_rate=None if worst is None else worst["rate"],
         excess=relative_excess((row["median_excess_cost"], row["median_label_cost"]) for row in counted),
     )

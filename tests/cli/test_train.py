@@ -16,9 +16,13 @@ import hno
 from hno.cli import evaluate
 from hno.cli.evaluate import draw
 from hno.cli.results import Results
+from hno.cli.train import label_statistics
 from hno.evaluation.callbacks import StopOnDivergence
 from hno.evaluation.closed_loop import TypeRow
+from hno.games import make
+from hno.types import Status, join, part
 from tests.cli.conftest import SMOKE, Command, Outcome
+from tests.fakes import fake_labels
 
 GAMES, OPERATORS, ACTIVATIONS = ("narrow_road", "lane_change", "drone"), ("hno", "sno"), ("tanh", "sin", "relu")
 KEYS = {
@@ -66,6 +70,16 @@ def test_collocation_begins_after_the_supervised_phase(command: Command) -> None
     lines = [line for line in run.text.splitlines() if "step " in line and " of 5:" in line]
     assert ["loss/residual" in line for line in lines] == [False, False, True, True, True]
     assert all("loss/value" in line for line in lines)
+
+
+def test_statistics_of_labels_are_those_of_each_type() -> None:
+    """A file of one's own may hold several types in any order."""
+    game, failed = make("narrow_road"), [Status.STALLED] * 2
+    mixed = join([fake_labels(game, (1.0, 1.0), 3), fake_labels(game, (2.0, 1.0), 2, status=failed)])
+    found = label_statistics([part(mixed, torch.tensor([0, 3, 1, 4, 2])), fake_labels(game, (5.0, 5.0), 1)])
+    assert [(e["theta"], e["starts"], e["status"]["stalled"], e["safe"]) for e in found] == [
+        ([1, 1], 3, 0, 3), ([2, 1], 2, 2, 0), ([5, 5], 1, 0, 1),
+    ]  # fmt: skip
 
 
 def test_results_hold_every_part_of_the_run(command: Command) -> None:

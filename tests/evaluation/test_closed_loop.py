@@ -187,11 +187,11 @@ def test_types_outside_the_range_of_the_game_are_marked() -> None:
 
 
 def test_types_outside_the_box_around_the_trained_ones_are_marked() -> None:
-    sets = [labelled([0.9], [0.5], theta=theta) for theta in (1.0, 1.5, 3.0, 4.0)]
+    sets = [labelled([0.9], [0.5], theta=theta) for theta in (0.5, 1.0, 1.5, 3.0, 4.0)]
     rows = collision_table(Walkers(), straight, sets, seen=[(1.0, 3.0), (3.0, 1.0)])
-    assert [row.outside_seen for row in rows] == [False, False, False, True]
+    assert [row.outside_seen for row in rows] == [True, False, False, False, True]
     assert remarks([row._asdict() for row in rows], 0.02) == [
-        "1 of 4 types lie outside the box around the trained ones: (4, 4)."
+        "2 of 5 types lie outside the box around the trained ones: (0.5, 0.5), (4, 4)."
     ]
 
 

@@ -14,6 +14,11 @@ def test_counts_add_and_the_worst_type_is_that_of_the_highest_rate_not_count() -
     assert (whole.worst_theta, whole.worst_rate) == ((1, 5), 0.1)
 
 
+def test_where_nothing_collides_no_type_is_the_worst() -> None:
+    whole = totals([type_row((1, 1), 0, 300), type_row((1, 5), 0, 20)])
+    assert (whole.worst_theta, whole.worst_rate, whole.rate) == (None, 0, 0)
+
+
 def test_excess_is_relative_to_the_equilibrium_and_negative_costs_keep_its_sign() -> None:
     table = [type_row((1, 1), 0, 9, 1.0, 10.0), type_row((1, 2), 0, 9, 3.0, -10.0), type_row((1, 3), 0, 9, -2.0, 10.0)]
     assert totals(table).excess == pytest.approx(0.1)
