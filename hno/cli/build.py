@@ -21,8 +21,8 @@ from hno.operators import ValueOperator, operators
 from hno.operators.optimizers import make_optimizer
 
 SIZES = (
-    "operator.width", "operator.depth", "data.trajectories", "data.validation", "data.workers", "trainer.max_steps",
-    "trainer.validate_every", "trainer.print_every", "trainer.threads", "evaluation.starts",
+    "operator.width", "operator.depth", "operator.members", "data.trajectories", "data.validation", "data.workers",
+    "trainer.max_steps", "trainer.validate_every", "trainer.print_every", "trainer.threads", "evaluation.starts",
 )  # fmt: skip
 """Entries that must be whole and positive where they are set."""
 FLAGS = (

@@ -15,7 +15,7 @@ from torchmetrics import WeightedMeanAbsolutePercentageError
 
 from hno.games import Game, games
 from hno.losses import LossTerm, Norm, Scales
-from hno.operators.deeponet import DeepONet
+from hno.operators.deeponet import DeepONet, Ensemble, nets
 from hno.operators.inputs import distinct_types, ego_views, tables
 from hno.operators.value_gradient import compiled
 from hno.pontryagin.adjoint import terminal_costate
@@ -51,6 +51,8 @@ class ValueOperator(L.LightningModule, abc.ABC):
         width: hidden and output width of trunk and branch.
         depth: hidden layers of trunk and branch.
         exact_terminal: V = -g + (tau / horizon) N rather than N, so that the boundary condition holds exactly.
+        members: nets that are trained on the same batches from different weights, an odd number; the operator is
+            their median.
         optimizer: needed for training only.
     """
 
@@ -74,6 +76,7 @@ class ValueOperator(L.LightningModule, abc.ABC):
         width: int = 64,
         depth: int = 4,
         exact_terminal: bool = False,
+        members: int = 1,
         optimizer: Optimizer | None = None,
     ) -> None:
         super().__init__()
@@ -83,6 +86,7 @@ class ValueOperator(L.LightningModule, abc.ABC):
             "width": width,
             "depth": depth,
             "exact_terminal": exact_terminal,
+            "members": members,
         }
         self.exact_terminal = exact_terminal
         self.seen_types: list[tuple[float, ...]] = []
@@ -104,9 +108,11 @@ class ValueOperator(L.LightningModule, abc.ABC):
         self.has_roles = len(set(game.roles)) > 1
         self.register_buffer("roles", torch.tensor(game.roles), persistent=False)
         sensors = game.sensors((game.type_box.lo + game.type_box.hi) / 2).shape[-1]
-        self.net = DeepONet(
-            1 + players * states + self.has_roles, sensors, activation, width, depth, activation_options
-        )
+        if not (isinstance(members, int) and members > 0 and members % 2):
+            raise ValueError(f"operator.members must be odd, so that there is a median; got {members!r}.")
+        sizes = 1 + players * states + self.has_roles, sensors
+        built = [DeepONet(*sizes, activation, width, depth, activation_options) for _ in range(members)]
+        self.net: DeepONet | Ensemble = built[0] if members == 1 else Ensemble(built)
         self.value_error = WeightedMeanAbsolutePercentageError()
         self.costate_error = WeightedMeanAbsolutePercentageError()
         self.register_buffer("running", torch.zeros(len(self.terms)))
@@ -120,7 +126,8 @@ class ValueOperator(L.LightningModule, abc.ABC):
 
     def compile_kernels(self) -> None:
         """Train through `torch.compile`, which pays in long runs."""
-        self.net.kernels = compiled()
+        for net in nets(self.net):
+            net.kernels = compiled()
 
     def names(self) -> dict[str, str]:
         """Registered names of game, operator and activation."""
@@ -147,7 +154,7 @@ class ValueOperator(L.LightningModule, abc.ABC):
         return self.game.terminal_value(x) + (tau / self.game.horizon).unsqueeze(-1) * raw
 
     def field(self, points: Points, types: Types | None = None) -> Field:
-        """Value, time derivative and every costate, of all players at once.
+        """Value, time derivative and every costate, of all players at once: medians over the members, entry by entry.
 
         With gradients enabled the result is differentiable in the parameters, but not in the points.
 
@@ -155,9 +162,17 @@ class ValueOperator(L.LightningModule, abc.ABC):
             points: where, physical units.
             types: the points' theta as a table, which is searched for otherwise.
         """
+        types = types or distinct_types(points.theta)
+        first, *others = (self._field(net, points, types) for net in nets(self.net))
+        if not others:
+            return first
+        return Field(*(torch.stack(parts).median(0).values for parts in zip(first, *others, strict=True)))
+
+    def _field(self, net: DeepONet, points: Points, types: Types) -> Field:
+        """The field of one member."""
         tau, x, theta = points
         inputs = self._inputs(tau, x).flatten(0, -2).detach()
-        raw, gradient = self.net.value_gradient(inputs, *self._branch(types or distinct_types(theta)))
+        raw, gradient = net.value_gradient(inputs, *self._branch(types))
         value = raw.view_as(theta) * self.value_scale
         slope = gradient[:, 0].view_as(theta) * (2 / self.game.horizon) * self.value_scale
         views = gradient[:, 1 : 1 + x[0].numel()].reshape(*theta.shape, *x.shape[-2:])
@@ -194,19 +209,23 @@ class ValueOperator(L.LightningModule, abc.ABC):
         return total
 
     def loss_terms(self, batch: Batch) -> dict[str, Tensor]:
-        """Norm of each weighted term whose stream is in the batch, scalars by name."""
+        """Norm of each weighted term whose stream is in the batch, mean over the members, scalars by name."""
         samples = {name: self._selected(name, batch[name]) for name in sorted(self.streams & batch.keys())}
         sizes = [len(sample.points.tau) for sample in samples.values()]
         points = Points(*(torch.cat(parts) for parts in zip(*(s.points for s in samples.values()), strict=True)))
-        field = self.field(points, tables([s.types or distinct_types(s.points.theta) for s in samples.values()]))
-        fields = dict(
-            zip(samples, (Field(*part) for part in zip(*(f.split(sizes) for f in field), strict=True)), strict=True)
-        )
-        return {
-            name: self.norm(self._residual(name, samples[self.term(name).stream], fields[self.term(name).stream]))
+        types = tables([s.types or distinct_types(s.points.theta) for s in samples.values()])
+        used = {
+            name: self.term(name).stream
             for name in self.terms
             if self.term(name).stream in samples and self.weights.get(name, 0) > 0
         }
+        norms: dict[str, list[Tensor]] = {name: [] for name in used}
+        for net in nets(self.net):
+            split = (part.split(sizes) for part in self._field(net, points, types))
+            fields = dict(zip(samples, (Field(*parts) for parts in zip(*split, strict=True)), strict=True))
+            for name, stream in used.items():
+                norms[name].append(self.norm(self._residual(name, samples[stream], fields[stream])))
+        return {name: torch.stack(each).mean() for name, each in norms.items()}
 
     def _residual(self, name: str, sample: Sample, field: Field) -> Tensor:
         """Residual of a term, in sizes of labels if `scaled`."""

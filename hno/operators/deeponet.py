@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 
 import torch
@@ -104,3 +104,28 @@ class DeepONet(nn.Module):
         activation, coefficient = type(self.trunk.activation), branch @ last.weight
         value, gradient = value_gradient(activation, y, which, coefficient, hidden, self.kernels)
         return value + (branch @ last.bias)[which], gradient
+
+
+class Ensemble(nn.Module):
+    """Several nets, and the median of their values.
+
+    Where two equilibria cost nearly the same, each net rounds off the ridge between them in its own way; the median
+    follows the majority.
+
+    Args:
+        members: an odd number of them.
+    """
+
+    def __init__(self, members: Iterable[DeepONet]) -> None:
+        super().__init__()
+        self.members = nn.ModuleList(members)
+
+    def forward(self, y: Tensor, sensors: Tensor, which: Tensor) -> Tensor:
+        """Median value at each row, (R,); arguments as of a member."""
+        return torch.stack([net(y, sensors, which) for net in self.members]).median(0).values
+
+
+def nets(net: nn.Module) -> list[DeepONet]:
+    """The members of an ensemble, or the net itself."""
+    members = net.members if isinstance(net, Ensemble) else [net]
+    return [member for member in members if isinstance(member, DeepONet)]

@@ -14,6 +14,7 @@ from hno.cli.results import config_hash
 from hno.data.exchange import write_own
 from hno.games import make
 from hno.losses import STREAMS
+from hno.operators.deeponet import nets
 from tests.fakes import fake_labels
 
 GROUPS = sorted(path.name for path in config_dir().iterdir() if path.is_dir())
@@ -47,6 +48,14 @@ def test_every_experiment_builds_for_every_game_and_operator(experiment: str, ga
     check_numbers(config)
     built = build_operator(config, build_game(config))
     assert build_data(config, built).streams == (STREAMS if operator == "hno" else {"bvp"})
+
+
+@pytest.mark.parametrize(
+    ("overrides", "members"), [((), 3), (("experiment=paper_grid",), 1), (("operator.members=5",), 5)]
+)
+def test_the_drone_is_a_median_of_nets_unless_asked_otherwise(overrides: tuple[str, ...], members: int) -> None:
+    config = composed("game=drone", *overrides)
+    assert len(nets(build_operator(config, build_game(config)).net)) == members
 
 
 def test_own_label_files_reach_the_data(tmp_path: Path) -> None:
