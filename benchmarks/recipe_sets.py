@@ -44,29 +44,36 @@ MOST = {"half types": 256, "beyond": 512, "1.5 x box": 256, "2 x box": 256}
 """Start states of a type after which the search for safe ones ends, where it is not 4096."""
 
 CORNERS = "data.types=[[1,1],[1,5],[5,1],[5,5]]"
-STEPS = "activation=tanh trainer.max_steps=1000 optimizer.lr=1e-2"
-SHORT = f"operator=sno {STEPS}"
+HNO = "operator=hno"
+STEEPENING = "operator=hno_annealed_slope +operator.exact_terminal=true"
+SHORT = "activation=tanh trainer.max_steps=1000"
 FIFTEEN = str([[a, b] for a, b in itertools.combinations_with_replacement(range(1, 6), 2)]).replace(" ", "")
-TEN = f"{STEPS} {CORNERS} data.trajectories=10"
-ANY = f"{STEPS} {CORNERS} operator=hno data.interior_types=box data.trajectories=200"
+TEN = f"{CORNERS} data.trajectories=10"
+ANY = f"{CORNERS} data.interior_types=box data.trajectories=200 loss.weights.residual"
 RECIPES: dict[str, dict[str, str]] = {
     "default": {
-        "sno": "operator=sno activation=tanh",
-        "sno, sin": "operator=sno activation=sin",
-        "sno, 1e-2": "operator=sno activation=tanh optimizer.lr=1e-2",
-        "hno": "operator=hno activation=tanh",
+        "sno, sin": "",
+        "sno, tanh": "activation=tanh",
+        "sno, tanh 1e-2": "activation=tanh optimizer.lr=1e-2",
+        "hno, sin": HNO,
+        "hno, tanh": f"{HNO} activation=tanh",
     },
     "hypothesis": {
-        "sno": f"{STEPS} operator=sno",
-        "hno": f"{STEPS} operator=hno",
-        "sno, time of hno": f"{STEPS} trainer.max_steps=1250 operator=sno",
-        "sno, corners": f"{STEPS} {CORNERS} operator=sno data.trajectories=200",
-        "hno, corners": f"{STEPS} {CORNERS} operator=hno data.trajectories=200",
-        "sno, corners, 50": f"{STEPS} {CORNERS} operator=sno data.trajectories=50",
-        "hno, corners, 50": f"{STEPS} {CORNERS} operator=hno data.trajectories=50",
+        "sno": "",
+        "hno": HNO,
+        "sno, time of hno": "trainer.max_steps=2500",
+        "sno, corners": f"{CORNERS} data.trajectories=200",
+        "hno, corners": f"{HNO} {CORNERS} data.trajectories=200",
+        "sno, corners, 50": f"{CORNERS} data.trajectories=50",
+        "hno, corners, 50": f"{HNO} {CORNERS} data.trajectories=50",
+    },
+    "ten labels": {
+        "sno": TEN,
+        "hno": f"{TEN} {HNO}",
+        "hno, weight 0.1": f"{TEN} {HNO} loss.weights.residual=0.1",
     },
     "activations": {
-        f"{name} {rate:g}": f"{SHORT} activation={name} optimizer.lr={rate:g}"
+        f"{name} {rate:g}": f"activation={name} trainer.max_steps=1000 optimizer.lr={rate:g}"
         for name, rates in {
             "tanh": (1e-3, 3e-3, 1e-2, 3e-2),
             "relu": (3e-3, 1e-2, 3e-2),
@@ -77,60 +84,64 @@ RECIPES: dict[str, dict[str, str]] = {
         for rate in rates
     },
     "optimizers": {
-        "soap 1e-2": SHORT,
-        "soap 3e-3": f"{SHORT} optimizer.lr=3e-3",
-        "soap 1e-2, polish": f"{SHORT} trainer.polish=100",
-        "soap 1e-2, linear": f"{SHORT} optimizer.schedule=linear",
-        "soap 1e-2, clip 1": f"{SHORT} trainer.gradient_clip_val=1.0",
+        "soap 1e-2": f"{SHORT} optimizer.lr=1e-2",
+        "soap 3e-3": SHORT,
+        "soap 1e-2, polish": f"{SHORT} optimizer.lr=1e-2 trainer.polish=100",
+        "soap 1e-2, linear": f"{SHORT} optimizer.lr=1e-2 optimizer.schedule=linear",
+        "soap 1e-2, clip 1": f"{SHORT} optimizer.lr=1e-2 trainer.gradient_clip_val=1.0",
         "adam 3e-3": f"{SHORT} optimizer=adam optimizer.lr=3e-3",
         "adam 1e-2": f"{SHORT} optimizer=adam optimizer.lr=1e-2",
         "adamw 1e-2": f"{SHORT} optimizer=adamw optimizer.lr=1e-2",
         "muon 2e-2": f"{SHORT} optimizer=muon optimizer.lr=2e-2",
     },
     "losses": {
-        "huber": f"{SHORT} loss.norm=huber",
-        "l2": f"{SHORT} loss.norm=l2",
-        "free terminal value": f"{SHORT} operator.exact_terminal=false",
-        "balance": f"{SHORT} loss.balance=true",
-        "costate 3": f"{SHORT} loss.weights.costate=3",
-        "physical units": f"{SHORT} loss.scaled=false",
-        "batch 1024, twice the steps": f"{SHORT} data.batch_sizes.bvp=1024 trainer.max_steps=2000",
-        "batch 4096, half the steps": f"{SHORT} data.batch_sizes.bvp=4096 trainer.max_steps=500",
+        "l1": "",
+        "huber": "loss.norm=huber",
+        "l2": "loss.norm=l2",
+        "free terminal value": "operator.exact_terminal=false",
+        "balance": "loss.balance=true",
+        "costate 3": "loss.weights.costate=3",
+        "physical units": "loss.scaled=false",
+        "batch 1024, twice the steps": "data.batch_sizes.bvp=1024 trainer.max_steps=4000",
+        "batch 4096, half the steps": "data.batch_sizes.bvp=4096 trainer.max_steps=1000",
+        "width 128": "operator.width=128",
     },
     "samplers": {
-        "mixed": f"{SHORT} operator=hno",
-        "uniform": f"{SHORT} operator=hno sampler=uniform",
-        "band": f"{SHORT} operator=hno sampler=band",
-        "labels": f"{SHORT} operator=hno sampler=labels",
-        "rollout": f"{SHORT} operator=hno sampler=rollout",
-        "hardest quarter": f"{SHORT} operator=hno loss.hardest=0.25",
+        "uniform": f"{HNO} sampler=uniform",
+        "band": f"{HNO} sampler=band",
+        "labels": f"{HNO} sampler=labels",
+        "rollout": f"{HNO} sampler=rollout",
+        "hardest quarter": f"{HNO} loss.hardest=0.25",
+        "weight 0.1": f"{HNO} loss.weights.residual=0.1",
+        "weight 0.004": f"{HNO} loss.weights.residual=0.004",
+        "penalty rising from 5 %": "operator=hno_annealed_height +operator.exact_terminal=true",
+        "penalty steepening from 5 %": STEEPENING,
     },
     "drone": {
-        "tanh, 4000": "operator=sno activation=tanh trainer.max_steps=4000",
-        "tanh, 8000": "operator=sno activation=tanh trainer.max_steps=8000",
-        "tanh, 1e-2": "operator=sno activation=tanh optimizer.lr=1e-2",
-        "tanh, 15 types": f"operator=sno activation=tanh data.trajectories=75 data.types={FIFTEEN}",
-        "tanh, 4000, 400 labels a type": "operator=sno activation=tanh trainer.max_steps=4000 data.trajectories=400",
-        "sin, 4000": "operator=sno activation=sin trainer.max_steps=4000",
+        "one net": "",
+        "one net, 4000": "trainer.max_steps=4000",
+        "one net, 4000, 400 labels a type": "trainer.max_steps=4000 data.trajectories=400",
+        "one net, weight decay": "optimizer.weight_decay=0.1",
+        "one net, tanh, 4000": "activation=tanh trainer.max_steps=4000",
+        "one net, tanh, 8000": "activation=tanh trainer.max_steps=8000",
+        "one net, tanh, 1e-2": "activation=tanh optimizer.lr=1e-2",
+        "one net, tanh, 15 types": f"activation=tanh data.trajectories=75 data.types={FIFTEEN}",
+        "one net, tanh, 4000, 400 labels a type": "activation=tanh trainer.max_steps=4000 data.trajectories=400",
+        "median of 3": "operator.members=3",
+        "median of 3, 1000": "operator.members=3 trainer.max_steps=1000",
     },
     "types": {
-        "4 types x 280": f"{SHORT} {CORNERS} data.trajectories=280",
-        "7 types x 160": SHORT,
-        "15 types x 75": f"{SHORT} data.trajectories=75 data.types={FIFTEEN}",
-    },
-    "ten labels": {
-        "sno": f"{TEN} operator=sno",
-        "hno 0.02": f"{TEN} operator=hno",
-        "hno 0.1": f"{TEN} operator=hno loss.weights.residual=0.1",
-        "hno 0.1, around labels": f"{TEN} operator=hno loss.weights.residual=0.1 sampler=labels",
-        "hno 0.002": f"{TEN} operator=hno loss.weights.residual=0.002",
+        "4 types x 280": f"{CORNERS} data.trajectories=280",
+        "7 types x 160": "",
+        "15 types x 75": f"data.trajectories=75 data.types={FIFTEEN}",
     },
     "any type": {
-        "0.1": f"{ANY} loss.weights.residual=0.1",
-        "0.01": f"{ANY} loss.weights.residual=0.01",
-        "0.1, around labels": f"{ANY} loss.weights.residual=0.1 sampler=labels",
-        "0.1, rollouts": f"{ANY} loss.weights.residual=0.1 sampler=rollout",
-        "0.1, whole horizon at once": f"{ANY} loss.weights.residual=0.1 data.widening=0",
+        "0.1": f"{HNO} {ANY}=0.1",
+        "0.01": f"{HNO} {ANY}=0.01",
+        "0.1, around labels": f"{HNO} {ANY}=0.1 sampler=labels",
+        "0.1, rollouts": f"{HNO} {ANY}=0.1 sampler=rollout",
+        "0.1, whole horizon at once": f"{HNO} {ANY}=0.1 data.widening=0",
+        "0.1, penalty steepening": f"{STEEPENING} {ANY}=0.1",
     },
 }
-"""Overrides by name, by set."""
+"""Overrides of the default recipe by name, by set; one net each, unless they say otherwise."""

@@ -19,6 +19,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import annealed  # noqa: F401  # registers operators
 import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
@@ -26,7 +27,7 @@ from recipe_sets import FEWER, MOST, RECIPES, SUITES
 from rich.console import Console
 from rich.table import Table
 
-from hno.cli.config import config_dir
+from hno.cli.config import config_dir, register_plugins
 from hno.cli.results import Results, config_hash
 from hno.cli.train import fit
 from hno.data.labels import Request, default_cache, safe_labels_for
@@ -136,7 +137,7 @@ def compared(
     for seed in arguments.seeds:
         with initialize_config_dir(str(config_dir()), version_base=None):
             fixed = [f"game={game}", f"seed={seed}", f"trainer.threads={arguments.threads}", "logger=csv"]
-            config = compose("train", overrides=[*fixed, *overrides.split()])
+            config = compose("train", overrides=[*fixed, "++operator.members=1", *overrides.split()])
         folder = arguments.out / arguments.set / game / name / str(seed)
         content = run(config, folder)
         if content["status"] != "trained":
@@ -186,6 +187,7 @@ def main() -> None:
         logging.getLogger(name).setLevel(logging.ERROR)
     warnings.filterwarnings("ignore", module="lightning.*|torch.*")
     torch.set_num_threads(arguments.threads)
+    register_plugins()
     console, everything = Console(width=60 + 50 * len(arguments.suites)), {}
     for game in arguments.games:
         cases: Cases = {}
