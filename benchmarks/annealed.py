@@ -1,4 +1,4 @@
-"""Operators whose HJI term sees a penalty that hardens during the hybrid phase, for the set "annealed" of recipes."""
+"""Operators whose HJI term sees a penalty that hardens during the hybrid phase, in the set "samplers" of recipes."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import copy
 from collections.abc import Mapping
 from typing import ClassVar
 
-import torch
 from torch import Tensor
 
 from hno.games import Game
@@ -14,10 +13,10 @@ from hno.losses import LossTerm
 from hno.losses.hji import Boundary, HJIResidual, hji_residual
 from hno.losses.supervised import CostateDeviation, ValueDeviation
 from hno.operators import ValueOperator, operators
-from hno.types import Field, Sample
+from hno.types import Batch, Field, Sample
 
-STEPS = 600
-"""Training steps with collocation points until the penalty is the game's: half of those of the default recipe."""
+FIRST, LAST = 800, 1400
+"""Steps between which the penalty hardens: the first half of the default recipe's hybrid phase."""
 START = 0.05
 """Share of the game's penalty at first."""
 
@@ -32,18 +31,14 @@ class _Annealed(LossTerm):
     constant: ClassVar[str]
     """Attribute of the game."""
     scale = HJIResidual.scale
-    step: Tensor
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.register_buffer("step", torch.tensor(0))
+    step: int = LAST
 
     def residual(self, game: Game, sample: Sample, field: Field) -> Tensor:
         """(B, P), 1/s."""
-        share = START ** (1 - min(1.0, float(self.step) / STEPS))
+        done = (self.step - FIRST) / (LAST - FIRST)
+        share = START ** (1 - min(1.0, max(0.0, done)))
         soft = copy.copy(game)
         setattr(soft, self.constant, share * getattr(game, self.constant))
-        self.step += int(self.training)
         return hji_residual(soft, sample.points, field)
 
 
@@ -59,8 +54,19 @@ class AnnealedSlope(_Annealed):
     constant = "penalty_slope"
 
 
+class _AnnealedOperator(ValueOperator):
+    """HNO that tells its residual the step."""
+
+    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        """As of any operator."""
+        term = self.term("residual")
+        assert isinstance(term, _Annealed)
+        term.step = self.global_step
+        return super().training_step(batch, batch_idx)
+
+
 @operators.register("hno_annealed_height")
-class AnnealedHeightOperator(ValueOperator):
+class AnnealedHeightOperator(_AnnealedOperator):
     """HNO with `AnnealedHeight`."""
 
     terms: ClassVar[Mapping[str, type[LossTerm]]] = {
@@ -72,7 +78,7 @@ class AnnealedHeightOperator(ValueOperator):
 
 
 @operators.register("hno_annealed_slope")
-class AnnealedSlopeOperator(ValueOperator):
+class AnnealedSlopeOperator(_AnnealedOperator):
     """HNO with `AnnealedSlope`."""
 
     terms: ClassVar[Mapping[str, type[LossTerm]]] = {

@@ -45,11 +45,11 @@ MOST = {"half types": 256, "beyond": 512, "1.5 x box": 256, "2 x box": 256}
 
 CORNERS = "data.types=[[1,1],[1,5],[5,1],[5,5]]"
 HNO = "operator=hno"
-STEEPENING = "operator=hno_annealed_slope +operator.exact_terminal=true"
 SHORT = "activation=tanh trainer.max_steps=1000"
 FIFTEEN = str([[a, b] for a, b in itertools.combinations_with_replacement(range(1, 6), 2)]).replace(" ", "")
-TEN = f"{CORNERS} data.trajectories=10"
-ANY = f"{CORNERS} data.interior_types=box data.trajectories=200 loss.weights.residual"
+STEEP = f"{SHORT} optimizer.lr=1e-2"
+TEN = f"{STEEP} {CORNERS} data.trajectories=10"
+ANY = f"{HNO} {STEEP} {CORNERS} data.trajectories=200 data.interior_types=box"
 RECIPES: dict[str, dict[str, str]] = {
     "default": {
         "sno, sin": "",
@@ -69,8 +69,10 @@ RECIPES: dict[str, dict[str, str]] = {
     },
     "ten labels": {
         "sno": TEN,
-        "hno": f"{TEN} {HNO}",
-        "hno, weight 0.1": f"{TEN} {HNO} loss.weights.residual=0.1",
+        "hno 0.02": f"{TEN} {HNO}",
+        "hno 0.1": f"{TEN} {HNO} loss.weights.residual=0.1",
+        "hno 0.1, around labels": f"{TEN} {HNO} loss.weights.residual=0.1 sampler=labels",
+        "hno 0.002": f"{TEN} {HNO} loss.weights.residual=0.002",
     },
     "activations": {
         f"{name} {rate:g}": f"activation={name} trainer.max_steps=1000 optimizer.lr={rate:g}"
@@ -84,11 +86,11 @@ RECIPES: dict[str, dict[str, str]] = {
         for rate in rates
     },
     "optimizers": {
-        "soap 1e-2": f"{SHORT} optimizer.lr=1e-2",
+        "soap 1e-2": STEEP,
         "soap 3e-3": SHORT,
-        "soap 1e-2, polish": f"{SHORT} optimizer.lr=1e-2 trainer.polish=100",
-        "soap 1e-2, linear": f"{SHORT} optimizer.lr=1e-2 optimizer.schedule=linear",
-        "soap 1e-2, clip 1": f"{SHORT} optimizer.lr=1e-2 trainer.gradient_clip_val=1.0",
+        "soap 1e-2, polish": f"{STEEP} trainer.polish=100",
+        "soap 1e-2, linear": f"{STEEP} optimizer.schedule=linear",
+        "soap 1e-2, clip 1": f"{STEEP} trainer.gradient_clip_val=1.0",
         "adam 3e-3": f"{SHORT} optimizer=adam optimizer.lr=3e-3",
         "adam 1e-2": f"{SHORT} optimizer=adam optimizer.lr=1e-2",
         "adamw 1e-2": f"{SHORT} optimizer=adamw optimizer.lr=1e-2",
@@ -97,14 +99,19 @@ RECIPES: dict[str, dict[str, str]] = {
     "losses": {
         "l1": "",
         "huber": "loss.norm=huber",
-        "l2": "loss.norm=l2",
-        "free terminal value": "operator.exact_terminal=false",
-        "balance": "loss.balance=true",
         "costate 3": "loss.weights.costate=3",
-        "physical units": "loss.scaled=false",
         "batch 1024, twice the steps": "data.batch_sizes.bvp=1024 trainer.max_steps=4000",
-        "batch 4096, half the steps": "data.batch_sizes.bvp=4096 trainer.max_steps=1000",
         "width 128": "operator.width=128",
+    },
+    "short losses": {
+        "huber": f"{STEEP} loss.norm=huber",
+        "l2": f"{STEEP} loss.norm=l2",
+        "free terminal value": f"{STEEP} operator.exact_terminal=false",
+        "balance": f"{STEEP} loss.balance=true",
+        "costate 3": f"{STEEP} loss.weights.costate=3",
+        "physical units": f"{STEEP} loss.scaled=false",
+        "batch 1024, twice the steps": f"{STEEP} data.batch_sizes.bvp=1024 trainer.max_steps=2000",
+        "batch 4096, half the steps": f"{STEEP} data.batch_sizes.bvp=4096 trainer.max_steps=500",
     },
     "samplers": {
         "uniform": f"{HNO} sampler=uniform",
@@ -112,10 +119,8 @@ RECIPES: dict[str, dict[str, str]] = {
         "labels": f"{HNO} sampler=labels",
         "rollout": f"{HNO} sampler=rollout",
         "hardest quarter": f"{HNO} loss.hardest=0.25",
-        "weight 0.1": f"{HNO} loss.weights.residual=0.1",
-        "weight 0.004": f"{HNO} loss.weights.residual=0.004",
         "penalty rising from 5 %": "operator=hno_annealed_height +operator.exact_terminal=true",
-        "penalty steepening from 5 %": STEEPENING,
+        "penalty steepening from 5 %": "operator=hno_annealed_slope +operator.exact_terminal=true",
     },
     "drone": {
         "one net": "",
@@ -128,7 +133,6 @@ RECIPES: dict[str, dict[str, str]] = {
         "one net, tanh, 15 types": f"activation=tanh data.trajectories=75 data.types={FIFTEEN}",
         "one net, tanh, 4000, 400 labels a type": "activation=tanh trainer.max_steps=4000 data.trajectories=400",
         "median of 3": "operator.members=3",
-        "median of 3, 1000": "operator.members=3 trainer.max_steps=1000",
     },
     "types": {
         "4 types x 280": f"{CORNERS} data.trajectories=280",
@@ -136,12 +140,12 @@ RECIPES: dict[str, dict[str, str]] = {
         "15 types x 75": f"data.trajectories=75 data.types={FIFTEEN}",
     },
     "any type": {
-        "0.1": f"{HNO} {ANY}=0.1",
-        "0.01": f"{HNO} {ANY}=0.01",
-        "0.1, around labels": f"{HNO} {ANY}=0.1 sampler=labels",
-        "0.1, rollouts": f"{HNO} {ANY}=0.1 sampler=rollout",
-        "0.1, whole horizon at once": f"{HNO} {ANY}=0.1 data.widening=0",
-        "0.1, penalty steepening": f"{STEEPENING} {ANY}=0.1",
+        "sno": f"{STEEP} {CORNERS} data.trajectories=200",
+        "0.1": f"{ANY} loss.weights.residual=0.1",
+        "0.01": f"{ANY} loss.weights.residual=0.01",
+        "0.1, around labels": f"{ANY} loss.weights.residual=0.1 sampler=labels",
+        "0.1, rollouts": f"{ANY} loss.weights.residual=0.1 sampler=rollout",
+        "0.1, whole horizon at once": f"{ANY} loss.weights.residual=0.1 data.widening=0",
     },
 }
 """Overrides of the default recipe by name, by set; one net each, unless they say otherwise."""

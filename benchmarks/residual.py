@@ -13,6 +13,7 @@ import argparse
 import json
 from pathlib import Path
 
+import annealed  # noqa: F401  # registers operators
 import torch
 from rich.console import Console
 from rich.table import Table

@@ -21,8 +21,8 @@ from hno.operators import ValueOperator, operators
 from hno.operators.optimizers import make_optimizer
 
 SIZES = (
-    "operator.width", "operator.depth", "operator.members", "data.trajectories", "data.validation", "data.workers",
-    "trainer.max_steps", "trainer.validate_every", "trainer.print_every", "trainer.threads", "evaluation.starts",
+    "operator.width", "operator.depth", "data.trajectories", "data.validation", "data.workers", "trainer.max_steps",
+    "trainer.validate_every", "trainer.print_every", "trainer.threads", "evaluation.starts",
 )  # fmt: skip
 """Entries that must be whole and positive where they are set."""
 FLAGS = (
@@ -67,6 +67,8 @@ def build_operator(config: DictConfig, game: Game) -> ValueOperator:
     """The chosen operator, ready to train."""
     options = plain(config.operator)
     cls = operators.get(options.pop("name"))
+    if options.get("members") == 1 and options["members"] is not True:
+        del options["members"]  # games may set it, and operators of your own need not know it
     optimizer = make_optimizer(steps=config.trainer.max_steps, **plain(config.optimizer))
     for term in config.loss.weights:
         losses.get(term)  # refuses a weight of a term that does not exist

@@ -45,7 +45,8 @@ def register_plugins() -> None:
     for group, registry in PLUGGABLE.items():
         for name in registry.names():
             if not (config_dir() / group / f"{name}.yaml").exists():
-                node = {"game": {"name": name, "constants": {}}} if group == "game" else {"name": name}
+                node: dict[str, Any] = {"game": {"name": name, "constants": {}}} if group == "game" else {"name": name}
+                node |= {"members": 1} if group == "operator" else {}
                 package = "_global_" if group == "game" else None
                 ConfigStore.instance().store(group=group, name=name, node=node, package=package)
 

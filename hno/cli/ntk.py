@@ -13,6 +13,7 @@ from hno.data.rows import NoLabelsError
 from hno.evaluation.ntk import rows_per_point, type_kernel
 from hno.evaluation.spectrum import Summary, summary
 from hno.operators import ValueOperator
+from hno.operators.deeponet import nets
 from hno.types import Extremal
 
 COLUMNS = ("theta", "points", "kernel", "condition", "rank", "effective rank", "largest eigenvalue")
@@ -29,7 +30,10 @@ def check_ntk(operator: ValueOperator, types: Iterable[tuple[float, ...]], setti
 
 
 def check_rows(operator: ValueOperator, settings: DictConfig) -> None:
-    """Raise ValueError unless the kernel has rows for at least one point."""
+    """Raise ValueError unless the operator is one net and its kernel has rows for at least one point."""
+    members = len(nets(operator.net))
+    if members > 1:
+        raise ValueError(f"ntk=true is for one net, this operator has {members}. Train it with operator.members=1.")
     whole_number("ntk_rows", settings.ntk_rows, rows_per_point(operator), "the rows of one point")
 
 

@@ -86,7 +86,7 @@ class ValueOperator(L.LightningModule, abc.ABC):
             "width": width,
             "depth": depth,
             "exact_terminal": exact_terminal,
-            "members": members,
+            **({"members": members} if members != 1 else {}),
         }
         self.exact_terminal = exact_terminal
         self.seen_types: list[tuple[float, ...]] = []
@@ -108,8 +108,11 @@ class ValueOperator(L.LightningModule, abc.ABC):
         self.has_roles = len(set(game.roles)) > 1
         self.register_buffer("roles", torch.tensor(game.roles), persistent=False)
         sensors = game.sensors((game.type_box.lo + game.type_box.hi) / 2).shape[-1]
-        if not (isinstance(members, int) and members > 0 and members % 2):
-            raise ValueError(f"operator.members must be odd, so that there is a median; got {members!r}.")
+        if not (type(members) is int and members > 0 and members % 2):
+            raise ValueError(
+                "operator.members must be an odd whole number, such as 1 or 3, so that there is a median; "
+                f"got {members!r}."
+            )
         sizes = 1 + players * states + self.has_roles, sensors
         built = [DeepONet(*sizes, activation, width, depth, activation_options) for _ in range(members)]
         self.net: DeepONet | Ensemble = built[0] if members == 1 else Ensemble(built)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -125,7 +126,6 @@ class Ensemble(nn.Module):
         return torch.stack([net(y, sensors, which) for net in self.members]).median(0).values
 
 
-def nets(net: nn.Module) -> list[DeepONet]:
+def nets(net: DeepONet | Ensemble) -> list[DeepONet]:
     """The members of an ensemble, or the net itself."""
-    members = net.members if isinstance(net, Ensemble) else [net]
-    return [member for member in members if isinstance(member, DeepONet)]
+    return cast(list[DeepONet], list(net.members)) if isinstance(net, Ensemble) else [net]

@@ -91,6 +91,8 @@ def test_types_inside_the_range_warn_of_nothing(command: Command) -> None:
             "operator.depth", "data.validation", "data.workers", "trainer.validate_every", "trainer.print_every",
             "trainer.threads", "optimizer.lr",
         )),
+        *((f"operator.members={number}", "operator.members must be an odd whole number, such as 1 or 3")
+          for number in ("0", "2", "1.5", "true", "null", "three")),
         ("data.batch_sizes.bvp=0", "'bvp' must be at least 1"),
         ("data.batch_sizes.interior=-8", "'interior' must be at least 1"),
         ("optimizer.lr=-0.1", "optimizer.lr must be a positive number"),

@@ -43,9 +43,16 @@ def test_training_can_end_with_the_kernel(command: Command) -> None:
 
 
 @pytest.mark.usefixtures("no_labels")
-@pytest.mark.parametrize("override", ["evaluation.ntk_rows=19", "evaluation.ntk=maybe"])
-def test_a_training_that_cannot_is_refused_before_it_begins(command: Command, override: str) -> None:
-    refused(command("train", *SMOKE, "evaluation.ntk=true", override), "must be")
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("evaluation.ntk_rows=19", "must be"),
+        ("evaluation.ntk=maybe", "must be"),
+        ("operator.members=3", "ntk=true is for one net, this operator has 3. Train it with operator.members=1"),
+    ],
+)
+def test_a_training_that_cannot_is_refused_before_it_begins(command: Command, override: str, message: str) -> None:
+    refused(command("train", *SMOKE, "evaluation.ntk=true", override), message)
 
 
 def test_no_kernel_unless_asked_for(command: Command, random_checkpoint: Path) -> None:

@@ -2,14 +2,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from importlib.metadata import EntryPoint
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import pytest
 import torch
 
 import hno
 from hno import registry
-from hno.games import games
+from hno.games import Game, games
 from hno.games.testing import check_game
 from hno.losses.supervised import ValueDeviation
 from hno.operators import activations, operators
@@ -105,6 +105,10 @@ def test_operator_and_activation_registered_in_a_test(command: Command) -> None:
     @operators.register("values_only")
     class ValuesOnly(ValueOperator):
         terms: ClassVar = {"value": ValueDeviation}
+
+        def __init__(self, game: Game, activation: str = "tanh", **options: Any) -> None:
+            assert "members" not in options
+            super().__init__(game, activation, **options)
 
     run = command("train", *SMOKE, "operator=values_only", "activation=softsign", "trainer.max_steps=2")
     assert run.code == 0, run.text

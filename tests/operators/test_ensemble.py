@@ -1,4 +1,4 @@
-"""An operator of several members: their median, each trained as it would be alone."""
+"""An operator of several members: their median, each trained along the gradient that it would have alone."""
 
 from __future__ import annotations
 
@@ -65,7 +65,9 @@ def test_one_member_that_errs_changes_little(make_operator: MakeOperator) -> Non
 
 
 @pytest.mark.parametrize("name", ["hno", "sno"])
-def test_every_member_is_trained_as_it_would_be_alone(make_operator: MakeOperator, name: str) -> None:
+def test_every_member_is_trained_along_the_gradient_that_it_would_have_alone(
+    make_operator: MakeOperator, name: str
+) -> None:
     operator = make_operator("lane_change", name, members=3).double()
     silence(operator)
     points = Points(*(part.double() for part in random_points(operator.game, 12)))
@@ -96,7 +98,9 @@ def test_a_checkpoint_keeps_every_member(make_operator: MakeOperator, tmp_path: 
     assert all(map(torch.equal, loaded, operator.field(points)))
 
 
-@pytest.mark.parametrize("members", [0, 2, -1, 1.0])
+@pytest.mark.parametrize("members", [0, 2, -1, 1.0, True, None, "three"])
 def test_an_ensemble_needs_a_median(make_operator: MakeOperator, members: object) -> None:
-    with pytest.raises(ValueError, match=f"operator.members must be odd.*got {members!r}"):
+    with pytest.raises(
+        ValueError, match=rf"operator.members must be an odd whole number, such as 1 or 3.*got {members!r}\."
+    ):
         make_operator(members=members)
