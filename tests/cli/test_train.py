@@ -20,6 +20,7 @@ from hno.cli.train import label_statistics
 from hno.evaluation.callbacks import StopOnDivergence
 from hno.evaluation.closed_loop import TypeRow
 from hno.games import make
+from hno.operators.deeponet import nets
 from hno.types import Status, join, part
 from tests.cli.conftest import SMOKE, Command, Outcome
 from tests.fakes import fake_labels
@@ -59,9 +60,10 @@ def test_five_steps(command: Command, game: str, operator: str, activation: str)
     u = policy(torch.full((3,), policy.game.horizon), x, torch.full((3, 2), 2.5))
     assert u.shape == (3, 2, policy.game.control_dim)
     assert bool(u.isfinite().all())
-    trunk, branch = (weights(run.folder)[f"net.{net}.activation.slope"] for net in ("trunk", "branch"))
-    assert abs(float(trunk) - 0.1) > 1e-6
-    assert float(trunk) != float(branch)
+    members = nets(policy.operator.net)
+    slopes = [float(net.activation.slope) for member in members for net in (member.trunk, member.branch)]
+    assert all(abs(slope - 0.1) > 1e-6 for slope in slopes)
+    assert len(set(slopes)) == len(slopes) == (6 if game == "drone" else 2)
 
 
 def test_collocation_begins_after_the_supervised_phase(command: Command) -> None:
