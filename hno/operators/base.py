@@ -15,7 +15,7 @@ from torchmetrics import WeightedMeanAbsolutePercentageError
 
 from hno.games import Game, games
 from hno.losses import LossTerm, Norm, Scales
-from hno.operators.deeponet import DeepONet, Ensemble, nets
+from hno.operators.deeponet import DeepONet, median_of, nets
 from hno.operators.inputs import distinct_types, ego_views, tables
 from hno.operators.value_gradient import compiled
 from hno.pontryagin.adjoint import terminal_costate
@@ -108,14 +108,8 @@ class ValueOperator(L.LightningModule, abc.ABC):
         self.has_roles = len(set(game.roles)) > 1
         self.register_buffer("roles", torch.tensor(game.roles), persistent=False)
         sensors = game.sensors((game.type_box.lo + game.type_box.hi) / 2).shape[-1]
-        if not (type(members) is int and members > 0 and members % 2):
-            raise ValueError(
-                "operator.members must be an odd whole number, such as 1 or 3, so that there is a median; "
-                f"got {members!r}."
-            )
-        sizes = 1 + players * states + self.has_roles, sensors
-        built = [DeepONet(*sizes, activation, width, depth, activation_options) for _ in range(members)]
-        self.net: DeepONet | Ensemble = built[0] if members == 1 else Ensemble(built)
+        inputs = 1 + players * states + self.has_roles
+        self.net = median_of(members, lambda: DeepONet(inputs, sensors, activation, width, depth, activation_options))
         self.value_error = WeightedMeanAbsolutePercentageError()
         self.costate_error = WeightedMeanAbsolutePercentageError()
         self.register_buffer("running", torch.zeros(len(self.terms)))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from types import MappingProxyType
 from typing import cast
 
@@ -124,6 +124,23 @@ class Ensemble(nn.Module):
     def forward(self, y: Tensor, sensors: Tensor, which: Tensor) -> Tensor:
         """Median value at each row, (R,); arguments as of a member."""
         return torch.stack([net(y, sensors, which) for net in self.members]).median(0).values
+
+
+def median_of(members: int, make: Callable[[], DeepONet]) -> DeepONet | Ensemble:
+    """One net, or several with weights of their own.
+
+    Args:
+        members: how many, an odd number.
+        make: builds one.
+
+    Raises:
+        ValueError: `members` is no odd whole number.
+    """
+    if not (type(members) is int and members > 0 and members % 2):
+        raise ValueError(
+            f"operator.members must be an odd whole number, such as 1 or 3, so that there is a median; got {members!r}."
+        )
+    return make() if members == 1 else Ensemble(make() for _ in range(members))
 
 
 def nets(net: DeepONet | Ensemble) -> list[DeepONet]:
