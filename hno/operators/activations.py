@@ -23,6 +23,8 @@ class Activation(nn.Module, abc.ABC):
 
     gain: ClassVar[float] = 1.0
     shift: ClassVar[float] = 0.0
+    keeps_first: ClassVar[bool] = True
+    """Whether the core's derivative is kept for the backward pass, rather than computed again by `first_of`."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -48,6 +50,11 @@ class Activation(nn.Module, abc.ABC):
         """The core and its derivative at `u`, whose memory may be taken."""
 
     @staticmethod
+    def first_of(core: Tensor) -> Tensor:
+        """The derivative from the core's value, for those that do not keep it."""
+        raise NotImplementedError
+
+    @staticmethod
     @abc.abstractmethod
     def times_second_(x: Tensor, core: Tensor, first: Tensor) -> Tensor:
         """Multiply `x` by the core's second derivative, in place, given its value and its derivative."""
@@ -69,6 +76,7 @@ class Tanh(Activation):
 
     gain = 2.0
     shift = -1.0
+    keeps_first = False
 
     @property
     def factor(self) -> Tensor:
@@ -81,10 +89,15 @@ class Tanh(Activation):
         return torch.sigmoid(u)
 
     @staticmethod
+    def first_of(core: Tensor) -> Tensor:
+        """Of the sigmoid, s - s^2."""
+        return torch.addcmul(core, core, core, value=-1)
+
+    @staticmethod
     def core_and_first_(u: Tensor) -> tuple[Tensor, Tensor]:
-        """The derivative is s - s^2."""
+        """The sigmoid and its derivative."""
         core = u.sigmoid_()
-        return core, torch.addcmul(core, core, core, value=-1)
+        return core, Tanh.first_of(core)
 
     @staticmethod
     def times_second_(x: Tensor, core: Tensor, first: Tensor) -> Tensor:
@@ -103,16 +116,23 @@ class Tanh(Activation):
 class ReLU(Activation):
     """Rectified linear unit, Kaiming initialisation."""
 
+    keeps_first = False
+
     @staticmethod
     def core(u: Tensor) -> Tensor:
         """max(u, 0)."""
         return torch.relu(u)
 
     @staticmethod
+    def first_of(core: Tensor) -> Tensor:
+        """1 where u > 0, otherwise 0."""
+        return (core > 0).to(core.dtype)
+
+    @staticmethod
     def core_and_first_(u: Tensor) -> tuple[Tensor, Tensor]:
-        """The derivative is 1 where u > 0, otherwise 0."""
-        first = (u > 0).to(u.dtype)
-        return u.relu_(), first
+        """max(u, 0) and its derivative."""
+        core = u.relu_()
+        return core, ReLU.first_of(core)
 
     @staticmethod
     def times_second_(x: Tensor, core: Tensor, first: Tensor) -> Tensor:
