@@ -32,6 +32,8 @@ class LossTerm(nn.Module, abc.ABC):
 
     stream: ClassVar[str]
     """The data stream that the term reads, one of `STREAMS`."""
+    met_by_exact_terminal: ClassVar[bool] = False
+    """Whether it vanishes, so that nothing has to read it, where the terminal condition holds by construction."""
 
     @abc.abstractmethod
     def residual(self, game: Game, sample: Sample, field: Field) -> Tensor:

@@ -47,6 +47,7 @@ class Boundary(LossTerm):
     """Terminal condition V(0, x) = -g(x) in reward form."""
 
     stream = "terminal"
+    met_by_exact_terminal = True
 
     def residual(self, game: Game, sample: Sample, field: Field) -> Tensor:
         """(B, P)."""

@@ -99,11 +99,14 @@ class ValueOperator(L.LightningModule, abc.ABC):
             raise ValueError(f"loss.hardest is a share in (0, 1]; got {hardest!r}.")
         self.balance, self.hardest = balance, hardest
         self.losses = nn.ModuleDict({name: term() for name, term in self.terms.items()})
-        self.weights = {
+        given = {
             name: float(w) for name, w in (weights or dict.fromkeys(self.terms, 1.0)).items() if name in self.terms
         }
-        if not any(weight > 0 for weight in self.weights.values()) or not all(map(_is_weight, self.weights.values())):
-            raise ValueError(f"Loss weights must be finite, not negative and not all 0; got {self.weights}.")
+        self.weights = {
+            name: w for name, w in given.items() if not (exact_terminal and self.terms[name].met_by_exact_terminal)
+        }
+        if not all(map(_is_weight, given.values())) or not any(self.weights.values()):
+            raise ValueError(f"Loss weights must be finite, not negative and not all 0; got {given}.")
         players, states = game.players, game.state_dim
         self.has_roles = len(set(game.roles)) > 1
         self.register_buffer("roles", torch.tensor(game.roles), persistent=False)

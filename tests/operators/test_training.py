@@ -10,6 +10,7 @@ from torch import Tensor
 
 from hno.games import make
 from hno.losses import Scales, hji_residual
+from hno.losses.hji import Boundary
 from hno.operators import ValueOperator, operators
 from hno.operators.inputs import distinct_types
 from hno.operators.optimizers import OPTIMIZERS, SCHEDULES, make_optimizer, muon
@@ -111,6 +112,17 @@ def test_streams_are_those_of_the_weighted_terms(
     make_operator: MakeOperator, name: str, weights: Mapping[str, float] | None, streams: set[str]
 ) -> None:
     assert make_operator(name=name, weights=weights).streams == streams
+
+
+def test_a_boundary_that_holds_exactly_needs_no_points(make_operator: MakeOperator) -> None:
+    """The term would be 0 and have no gradient: the loss without it is the same."""
+    operator, free = (make_operator(weights=ALL, exact_terminal=exact) for exact in (True, False))
+    assert operator.streams == free.streams - {"terminal"}
+    operator.load_state_dict(free.state_dict())
+    batch = random_batch(operator)
+    missing = Boundary().residual(operator.game, batch["terminal"], operator.field(batch["terminal"].points))
+    assert missing.abs().max() == 0
+    assert operator.loss_terms(batch).keys() == free.loss_terms(batch).keys() - {"boundary"}
 
 
 def test_weights_of_foreign_terms_are_ignored(make_operator: MakeOperator) -> None:
