@@ -52,10 +52,15 @@ def check_numbers(config: DictConfig) -> None:
         value = OmegaConf.select(config, name)
         if not OmegaConf.is_list(value) or (needed and not value):
             raise ValueError(f"{name} must list player types, such as [[1, 1], [5, 5]]; got {value!r}.")
-    for name in ("data.pretrain", "data.widening"):
+    for name in ("data.pretrain", "data.widening", "data.finish"):
         value = OmegaConf.select(config, name)
         if not (is_number(value) and 0 <= value <= 1):
             raise ValueError(f"{name} is a share of the run and must lie in [0, 1]; got {value!r}.")
+    if config.data.pretrain + config.data.finish > 1:
+        raise ValueError(
+            "data.pretrain and data.finish are shares of one run and may add up to 1 at most; got "
+            f"{config.data.pretrain:g} and {config.data.finish:g}."
+        )
 
 
 def build_game(config: DictConfig) -> Game:
@@ -98,7 +103,11 @@ def build_data(config: DictConfig, operator: ValueOperator, report: Report | Non
         cache=cache_folder(data.cache),
         seed=config.seed,
         batch_sizes=plain(data.batch_sizes),
-        curriculum=Curriculum(round(data.pretrain * steps), round(data.widening * steps)),
+        curriculum=Curriculum(
+            round(data.pretrain * steps),
+            round(data.widening * steps),
+            round((1 - data.finish) * steps) if data.finish else None,
+        ),
         shares=plain(config.sampler),
         interior_types=data.interior_types,
         validation=data.validation,

@@ -12,10 +12,12 @@ class Curriculum(NamedTuple):
     """Step at which collocation begins; before it the training is supervised only."""
     length: int
     """Steps until the window is the whole horizon; 0 opens it at once."""
+    end: int | None = None
+    """Step at which collocation ends, after which the training is supervised only again; None for never."""
 
     def active(self, step: int) -> bool:
         """Whether collocation points are drawn at this step."""
-        return step >= self.start
+        return self.start <= step and (self.end is None or step < self.end)
 
     def window(self, step: int) -> float:
         """Share of the horizon that tau may reach, in [0, 1]."""

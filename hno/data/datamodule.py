@@ -83,9 +83,10 @@ class GameData(L.LightningDataModule):
         check_shares(shares)
         if interior_types not in ("labelled", "box"):
             raise ValueError(f"interior_types must be 'labelled' or 'box'; got {interior_types!r}.")
-        if "bvp" not in streams and curriculum.start > 0:
+        if "bvp" not in streams and (curriculum.start > 0 or curriculum.end is not None):
             raise ValueError(
-                "Nothing is trained before collocation begins: weigh a supervised term, or set pretrain to 0."
+                "Nothing is trained before collocation begins and after it ends: weigh a supervised term, or set "
+                "pretrain and finish to 0."
             )
         for name, size in {"trajectories": trajectories, "validation": validation, **batch_sizes}.items():
             if size is not None and size < 1:

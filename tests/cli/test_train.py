@@ -3,6 +3,7 @@ from __future__ import annotations
 import csv
 import itertools
 import json
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -66,11 +67,14 @@ def test_five_steps(command: Command, game: str, operator: str, activation: str)
     assert len(set(slopes)) == len(slopes) == (6 if game == "drone" else 2)
 
 
-def test_collocation_begins_after_the_supervised_phase(command: Command) -> None:
-    """Of five steps, two are supervised only; then the boundary and residual terms join."""
-    run = command("train", *SMOKE, "trainer.max_steps=5", "trainer.print_every=1")
+@pytest.mark.parametrize(("finish", "different"), [(0, 3), (0.4, 1)])
+def test_collocation_comes_between_the_supervised_phases(command: Command, finish: float, different: int) -> None:
+    """Of five steps, two are supervised only; then the residual joins. Once it ended its last value is logged."""
+    run = command("train", *SMOKE, f"data.finish={finish}", "trainer.max_steps=5", "trainer.print_every=1")
     lines = [line for line in run.text.splitlines() if "step " in line and " of 5:" in line]
-    assert ["loss/residual" in line for line in lines] == [False, False, True, True, True]
+    residuals = [re.findall(r"loss/residual (\S+?)(?:,|$)", line) for line in lines]
+    assert list(map(len, residuals)) == [0, 0, 1, 1, 1]
+    assert len({number for (number,) in residuals[2:]}) == different
     assert all("loss/value" in line for line in lines)
 
 

@@ -91,9 +91,18 @@ def test_collocation_waits_for_the_curriculum(make_data: MakeData) -> None:
     assert data.batch(5).keys() == {"bvp", "interior", "terminal"}
 
 
-def test_nothing_to_train_before_collocation_is_refused(make_data: MakeData) -> None:
-    with pytest.raises(ValueError, match="pretrain"):
-        make_data(streams={"interior", "terminal"}, curriculum=Curriculum(5, 10))
+def test_collocation_ends_with_the_curriculum(make_data: MakeData) -> None:
+    """Labelled rows are drawn as if it went on."""
+    data, endless = (make_data(curriculum=Curriculum(5, 10, end)) for end in (8, None))
+    assert equal(data.batch(7), endless.batch(7))
+    assert data.batch(8).keys() == {"bvp"}
+    assert torch.equal(data.batch(8)["bvp"].points.x, endless.batch(8)["bvp"].points.x)
+
+
+@pytest.mark.parametrize("curriculum", [Curriculum(5, 10), Curriculum(0, 10, 20)])
+def test_nothing_to_train_without_collocation_is_refused(make_data: MakeData, curriculum: Curriculum) -> None:
+    with pytest.raises(ValueError, match="pretrain and finish"):
+        make_data(streams={"interior", "terminal"}, curriculum=curriculum)
 
 
 def test_batch_sizes(make_data: MakeData) -> None:

@@ -24,6 +24,14 @@ def test_window_is_shut_before_and_open_after() -> None:
     assert curriculum.window(10_000) == 1.0
 
 
+def test_window_is_shut_again_at_the_end() -> None:
+    curriculum = Curriculum(start=100, length=50, end=120)
+    assert curriculum.window(119) == pytest.approx(20 / 50)
+    assert curriculum.active(119)
+    assert not curriculum.active(120)
+    assert curriculum.window(120) == 0.0
+
+
 def test_window_depends_on_the_step_alone() -> None:
     curriculum = Curriculum(start=3, length=7)
     assert [curriculum.window(step) for step in (9, 4, 9)] == [curriculum.window(step) for step in (9, 4, 9)]
