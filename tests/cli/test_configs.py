@@ -47,7 +47,8 @@ def test_every_experiment_builds_for_every_game_and_operator(experiment: str, ga
     config = composed(f"experiment={experiment}", f"game={game}", f"operator={operator}")
     check_numbers(config)
     built = build_operator(config, build_game(config))
-    assert build_data(config, built).streams == (STREAMS if operator == "hno" else {"bvp"})
+    needed = {"sno": {"bvp"}, "hno": STREAMS - ({"terminal"} if config.operator.exact_terminal else set())}
+    assert build_data(config, built).streams == needed[operator]
 
 
 @pytest.mark.parametrize(
@@ -56,6 +57,16 @@ def test_every_experiment_builds_for_every_game_and_operator(experiment: str, ga
 def test_the_drone_is_a_median_of_nets_unless_asked_otherwise(overrides: tuple[str, ...], members: int) -> None:
     config = composed("game=drone", *overrides)
     assert len(nets(build_operator(config, build_game(config)).net)) == members
+
+
+@pytest.mark.parametrize(
+    ("overrides", "phases"), [((), (400, 400, 1200)), (("experiment=paper_grid",), (800, 600, None))]
+)
+def test_hybrid_training_ends_supervised_but_in_the_papers_comparison(
+    overrides: tuple[str, ...], phases: tuple[int, int, int | None]
+) -> None:
+    config = composed("operator=hno", "trainer.max_steps=2000", *overrides)
+    assert build_data(config, build_operator(config, build_game(config))).curriculum == phases
 
 
 def test_own_label_files_reach_the_data(tmp_path: Path) -> None:
@@ -99,7 +110,7 @@ def test_paper_recipe_is_the_published_one() -> None:
     assert config.data.trajectories == 2000
     assert plain(config.sampler) == {"box": 1.0, "band": 0.0, "labels": 0.0, "rollout": 0.0}
     curriculum = build_data(config, build_operator(config, build_game(config))).curriculum
-    assert curriculum == (100_000, 200_000)
+    assert curriculum == (100_000, 200_000, None)
 
 
 def test_hash_names_what_determines_the_numbers() -> None:

@@ -70,7 +70,9 @@ def test_five_steps(command: Command, game: str, operator: str, activation: str)
 @pytest.mark.parametrize(("finish", "different"), [(0, 3), (0.4, 1)])
 def test_collocation_comes_between_the_supervised_phases(command: Command, finish: float, different: int) -> None:
     """Of five steps, two are supervised only; then the residual joins. Once it ended its last value is logged."""
-    run = command("train", *SMOKE, f"data.finish={finish}", "trainer.max_steps=5", "trainer.print_every=1")
+    run = command(
+        "train", *SMOKE, "data.pretrain=0.4", f"data.finish={finish}", "trainer.max_steps=5", "trainer.print_every=1"
+    )
     lines = [line for line in run.text.splitlines() if "step " in line and " of 5:" in line]
     residuals = [re.findall(r"loss/residual (\S+?)(?:,|$)", line) for line in lines]
     assert list(map(len, residuals)) == [0, 0, 1, 1, 1]
