@@ -16,7 +16,7 @@ from hno.operators import ValueOperator, operators
 from hno.types import Batch, Field, Sample
 
 FIRST, LAST = 800, 1400
-"""Steps between which the penalty hardens: the first half of the default recipe's hybrid phase."""
+"""Steps between which the penalty hardens: the first half of the hybrid phase of its recipes."""
 START = 0.05
 """Share of the game's penalty at first."""
 

@@ -44,9 +44,10 @@ MOST = {"half types": 256, "beyond": 512, "1.5 x box": 256, "2 x box": 256}
 """Start states of a type after which the search for safe ones ends, where it is not 4096."""
 
 CORNERS = "data.types=[[1,1],[1,5],[5,1],[5,5]]"
-PHASES = "data.pretrain=0.4 data.widening=0.3 data.finish=0"
-HNO = f"operator=hno {PHASES}"
-FINISH = "operator=hno"
+TO_THE_END = "data.pretrain=0.4 data.widening=0.3 data.finish=0"
+HNO = f"operator=hno {TO_THE_END}"
+FINISHED = "operator=hno data.pretrain=0.2 data.widening=0.2 data.finish=0.4"
+LATE = "operator=hno data.pretrain=0.4 data.widening=0.2 data.finish=0.2"
 SHORT = "activation=tanh trainer.max_steps=1000"
 FIFTEEN = str([[a, b] for a, b in itertools.combinations_with_replacement(range(1, 6), 2)]).replace(" ", "")
 STEEP = f"{SHORT} optimizer.lr=1e-2"
@@ -68,9 +69,9 @@ RECIPES: dict[str, dict[str, str]] = {
         "hno, corners": f"{HNO} {CORNERS} data.trajectories=200",
         "sno, corners, 50": f"{CORNERS} data.trajectories=50",
         "hno, corners, 50": f"{HNO} {CORNERS} data.trajectories=50",
-        "hno, finish": FINISH,
-        "hno, corners, finish": f"{FINISH} {CORNERS} data.trajectories=200",
-        "hno, corners, 50, finish": f"{FINISH} {CORNERS} data.trajectories=50",
+        "hno, finish": FINISHED,
+        "hno, corners, finish": f"{FINISHED} {CORNERS} data.trajectories=200",
+        "hno, corners, 50, finish": f"{FINISHED} {CORNERS} data.trajectories=50",
     },
     "ten labels": {
         "sno": TEN,
@@ -128,11 +129,11 @@ RECIPES: dict[str, dict[str, str]] = {
         "labels": f"{HNO} sampler=labels",
         "rollout": f"{HNO} sampler=rollout",
         "hardest quarter": f"{HNO} loss.hardest=0.25",
-        "penalty rising from 5 %": f"operator=hno_annealed_height +operator.exact_terminal=true {PHASES}",
-        "penalty steepening from 5 %": f"operator=hno_annealed_slope +operator.exact_terminal=true {PHASES}",
-        "supervised finish": FINISH,
-        "supervised finish, 20 %": f"{FINISH} data.pretrain=0.4 data.finish=0.2",
-        "supervised finish, 20 %, weight 0.1": f"{FINISH} data.pretrain=0.4 data.finish=0.2 loss.weights.residual=0.1",
+        "penalty rising from 5 %": f"operator=hno_annealed_height +operator.exact_terminal=true {TO_THE_END}",
+        "penalty steepening from 5 %": f"operator=hno_annealed_slope +operator.exact_terminal=true {TO_THE_END}",
+        "supervised finish": FINISHED,
+        "supervised finish, 20 %": LATE,
+        "supervised finish, 20 %, weight 0.1": f"{LATE} loss.weights.residual=0.1",
     },
     "drone": {
         "one net": "",

@@ -56,11 +56,6 @@ def check_numbers(config: DictConfig) -> None:
         value = OmegaConf.select(config, name)
         if not (is_number(value) and 0 <= value <= 1):
             raise ValueError(f"{name} is a share of the run and must lie in [0, 1]; got {value!r}.")
-    if config.data.pretrain + config.data.finish > 1:
-        raise ValueError(
-            "data.pretrain and data.finish are shares of one run and may add up to 1 at most; got "
-            f"{config.data.pretrain:g} and {config.data.finish:g}."
-        )
 
 
 def build_game(config: DictConfig) -> Game:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 import socket
 import sys
@@ -193,5 +194,8 @@ class StepLines(L.Callback):
     ) -> None:
         """Print the losses."""
         if trainer.global_step % self.every == 0:
-            losses = ", ".join(f"{k} {float(v):.4g}" for k, v in sorted(trainer.callback_metrics.items()))
-            log.info("step %d of %d: %s", trainer.global_step, trainer.max_steps, losses)
+            found = {name: float(value) for name, value in sorted(trainer.callback_metrics.items())}
+            shown = (
+                f"{name} {value:.4g}" for name, value in found.items() if name == "loss/total" or not math.isnan(value)
+            )
+            log.info("step %d of %d: %s", trainer.global_step, trainer.max_steps, ", ".join(shown))

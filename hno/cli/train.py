@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import shutil
 import time
 from collections.abc import Sequence
@@ -141,6 +142,7 @@ def fit(config: DictConfig, folder: Path, results: Results) -> L.Trainer:
     results.time("training", time.perf_counter() - began - validation.seconds)
     results.time("validation", validation.seconds)
     metrics = {name: float(value) for name, value in trainer.callback_metrics.items() if name.startswith("loss/")}
+    metrics = {name: value for name, value in metrics.items() if not math.isnan(value)}
     metrics |= trainer.validate(operator, datamodule=data, verbose=False)[0]
     checkpoint = BEST if (folder / BEST).exists() else "last.ckpt"
     best = None if validation.best is None else validation.best._asdict()

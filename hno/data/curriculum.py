@@ -13,7 +13,8 @@ class Curriculum(NamedTuple):
     length: int
     """Steps until the window is the whole horizon; 0 opens it at once."""
     end: int | None = None
-    """Step at which collocation ends, after which the training is supervised only again; None for never."""
+    """Step at which collocation ends, after which the training is supervised only again; None for never. There is none
+    at all where it ends before it begins."""
 
     def active(self, step: int) -> bool:
         """Whether collocation points are drawn at this step."""

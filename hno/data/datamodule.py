@@ -51,7 +51,7 @@ class GameData(L.LightningDataModule):
         cache: folder of label files.
         seed: of start states, batches and collocation points.
         batch_sizes: rows per step of each stream; None for every labelled row, each step.
-        curriculum: when collocation begins and how the window widens.
+        curriculum: when collocation begins, how the window widens, and when it ends.
         shares: where interior points come from, see `hno.data.sampling.SOURCES`.
         interior_types: "labelled" draws the types of collocation points among `types`, "box" from the type box.
         validation: trajectories per type that are held out.

@@ -52,7 +52,7 @@ class Activation(nn.Module, abc.ABC):
     @staticmethod
     def first_of(core: Tensor) -> Tensor:
         """The derivative from the core's value, for those that do not keep it."""
-        raise NotImplementedError
+        raise NotImplementedError("An activation with keeps_first = False needs first_of(core), the core's derivative.")
 
     @staticmethod
     @abc.abstractmethod

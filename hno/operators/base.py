@@ -50,7 +50,8 @@ class ValueOperator(L.LightningModule, abc.ABC):
         hardest: share of the collocation points that count, those of the largest residuals.
         width: hidden and output width of trunk and branch.
         depth: hidden layers of trunk and branch.
-        exact_terminal: V = -g + (tau / horizon) N rather than N, so that the boundary condition holds exactly.
+        exact_terminal: V = -g + (tau / horizon) N rather than N, so that the boundary condition holds exactly and its
+            term is left out.
         members: nets that are trained on the same batches from different weights, an odd number; the operator is
             their median.
         optimizer: needed for training only.
@@ -106,7 +107,10 @@ class ValueOperator(L.LightningModule, abc.ABC):
             name: w for name, w in given.items() if not (exact_terminal and self.terms[name].met_by_exact_terminal)
         }
         if not all(map(_is_weight, given.values())) or not any(self.weights.values()):
-            raise ValueError(f"Loss weights must be finite, not negative and not all 0; got {given}.")
+            raise ValueError(
+                f"Loss weights must be finite, not negative and not all 0; got {given}. With an exact terminal "
+                "condition the boundary does not count."
+            )
         players, states = game.players, game.state_dim
         self.has_roles = len(set(game.roles)) > 1
         self.register_buffer("roles", torch.tensor(game.roles), persistent=False)
@@ -201,10 +205,11 @@ class ValueOperator(L.LightningModule, abc.ABC):
         return self.game.sensors(types.distinct).flatten(0, 1), which.flatten()
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        """Weighted sum of the norms of the terms whose stream is in the batch."""
+        """Weighted sum of the norms of the terms whose stream is in the batch; the others are logged as NaN."""
         losses = self.loss_terms(batch)
         total = torch.stack([self.weights[name] * self._balanced(name, loss) for name, loss in losses.items()]).sum()
-        self.log_dict({f"loss/{name}": loss.detach() for name, loss in losses.items()})
+        absent = {f"loss/{name}": math.nan for stream in self.streams - batch.keys() for name in self._weighted(stream)}
+        self.log_dict(absent | {f"loss/{name}": loss.detach() for name, loss in losses.items()})
         self.log("loss/total", total.detach(), prog_bar=True)
         return total
 

@@ -299,7 +299,9 @@ def test_rollout_states_are_those_of_the_policy(command: Command, monkeypatch: p
 
 def test_polishing_is_part_of_the_run(command: Command, tmp_path: Path) -> None:
     plain = command("train", *SMOKE, "trainer.max_steps=4", folder=tmp_path / "plain")
-    run = command("train", *SMOKE, "trainer.max_steps=4", "trainer.polish=5", folder=tmp_path / "polished")
+    run = command(
+        "train", *SMOKE, "data.finish=0", "trainer.max_steps=4", "trainer.polish=5", folder=tmp_path / "polished"
+    )
     assert run.code == 0, run.text
     assert "L-BFGS: loss " in run.text
     after, before = (float(word) for word in run.text.split("L-BFGS: loss ")[1].split("\n")[0].split(", was "))

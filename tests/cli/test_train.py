@@ -3,7 +3,6 @@ from __future__ import annotations
 import csv
 import itertools
 import json
-import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -67,16 +66,15 @@ def test_five_steps(command: Command, game: str, operator: str, activation: str)
     assert len(set(slopes)) == len(slopes) == (6 if game == "drone" else 2)
 
 
-@pytest.mark.parametrize(("finish", "different"), [(0, 3), (0.4, 1)])
-def test_collocation_comes_between_the_supervised_phases(command: Command, finish: float, different: int) -> None:
-    """Of five steps, two are supervised only; then the residual joins. Once it ended its last value is logged."""
-    run = command(
-        "train", *SMOKE, "data.pretrain=0.4", f"data.finish={finish}", "trainer.max_steps=5", "trainer.print_every=1"
-    )
+@pytest.mark.parametrize(("finish", "hybrid"), [(0, [2, 3, 4]), (0.4, [2]), (1, [])])
+def test_collocation_comes_between_the_supervised_phases(command: Command, finish: float, hybrid: list[int]) -> None:
+    """Of five steps, two are supervised only; then the residual joins, and what is logged ends with it."""
+    phases = "data.pretrain=0.4", f"data.finish={finish}", "operator.exact_terminal=false"
+    run = command("train", *SMOKE, *phases, "trainer.max_steps=5", "trainer.print_every=1")
     lines = [line for line in run.text.splitlines() if "step " in line and " of 5:" in line]
-    residuals = [re.findall(r"loss/residual (\S+?)(?:,|$)", line) for line in lines]
-    assert list(map(len, residuals)) == [0, 0, 1, 1, 1]
-    assert len({number for (number,) in residuals[2:]}) == different
+    for term in ("loss/residual", "loss/boundary"):
+        assert [step for step, line in enumerate(lines) if term in line] == hybrid
+        assert (term in run.results["metrics"]) == (4 in hybrid)
     assert all("loss/value" in line for line in lines)
 
 
