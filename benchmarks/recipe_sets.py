@@ -132,6 +132,7 @@ RECIPES: dict[str, dict[str, str]] = {
         "penalty rising from 5 %": f"operator=hno_annealed_height +operator.exact_terminal=true {TO_THE_END}",
         "penalty steepening from 5 %": f"operator=hno_annealed_slope +operator.exact_terminal=true {TO_THE_END}",
         "supervised finish": FINISHED,
+        "band, supervised finish": f"{FINISHED} sampler=band",
         "supervised finish, 20 %": LATE,
         "supervised finish, 20 %, weight 0.1": f"{LATE} loss.weights.residual=0.1",
     },
