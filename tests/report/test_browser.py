@@ -187,8 +187,10 @@ def test_numbers_under_a_heat_map_are_those_of_the_tooltip(browser):
     card = page.locator(".map:visible").first
     card.locator("summary").press("Enter")  # a click may miss: maps are drawn as they come into view, and move it
     first = card.locator("tbody tr").first.inner_text()
-    cell = card.locator(".mark-rect path").first
+    card.scroll_into_view_if_needed()
     card.locator("svg").wait_for()
+    cell = card.locator(".mark-rect path").first
+    cell.scroll_into_view_if_needed()
     cell.hover(force=True)
     page.wait_for_selector("#tip:not([hidden])")
     text = page.inner_text("#tip")
