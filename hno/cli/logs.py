@@ -194,8 +194,6 @@ class StepLines(L.Callback):
     ) -> None:
         """Print the losses."""
         if trainer.global_step % self.every == 0:
-            found = {name: float(value) for name, value in sorted(trainer.callback_metrics.items())}
-            shown = (
-                f"{name} {value:.4g}" for name, value in found.items() if name == "loss/total" or not math.isnan(value)
-            )
-            log.info("step %d of %d: %s", trainer.global_step, trainer.max_steps, ", ".join(shown))
+            found = [(name, float(value)) for name, value in sorted(trainer.callback_metrics.items())]
+            losses = ", ".join(f"{k} {v:.4g}" for k, v in found if k == "loss/total" or not math.isnan(v))
+            log.info("step %d of %d: %s", trainer.global_step, trainer.max_steps, losses)

@@ -141,8 +141,8 @@ def fit(config: DictConfig, folder: Path, results: Results) -> L.Trainer:
     trainer.save_checkpoint(folder / "last.ckpt", weights_only=False)
     results.time("training", time.perf_counter() - began - validation.seconds)
     results.time("validation", validation.seconds)
-    metrics = {name: float(value) for name, value in trainer.callback_metrics.items() if name.startswith("loss/")}
-    metrics = {name: value for name, value in metrics.items() if not math.isnan(value)}
+    losses = {name: float(value) for name, value in trainer.callback_metrics.items() if name.startswith("loss/")}
+    metrics = {name: loss for name, loss in losses.items() if not math.isnan(loss)}
     metrics |= trainer.validate(operator, datamodule=data, verbose=False)[0]
     checkpoint = BEST if (folder / BEST).exists() else "last.ckpt"
     best = None if validation.best is None else validation.best._asdict()

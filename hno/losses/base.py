@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import abc
+import math
+from collections.abc import Mapping
 from typing import ClassVar, NamedTuple
 
 import torch
@@ -42,6 +44,29 @@ class LossTerm(nn.Module, abc.ABC):
     @abc.abstractmethod
     def scale(self, game: Game, sample: Sample, scales: Scales) -> Tensor:
         """Size that makes the residual dimensionless, broadcastable to it."""
+
+
+def used_weights(
+    terms: Mapping[str, type[LossTerm]], weights: Mapping[str, float] | None, *, exact_terminal: bool
+) -> dict[str, float]:
+    """Weights of the terms that an operator reads, by name.
+
+    Args:
+        terms: of the operator.
+        weights: of any terms; those of others are ignored, and 1 each by default.
+        exact_terminal: leave out the terms that then vanish.
+
+    Raises:
+        ValueError: a weight is not finite or negative, or none is left that counts.
+    """
+    given = {name: float(w) for name, w in (weights or dict.fromkeys(terms, 1.0)).items() if name in terms}
+    used = {name: w for name, w in given.items() if not (exact_terminal and terms[name].met_by_exact_terminal)}
+    if not all(math.isfinite(w) and w >= 0 for w in given.values()) or not any(used.values()):
+        raise ValueError(
+            f"Loss weights must be finite, not negative and not all 0; got {given}. With an exact terminal condition "
+            "the boundary does not count."
+        )
+    return used
 
 
 class Norm(nn.Module):

@@ -23,8 +23,6 @@ class Activation(nn.Module, abc.ABC):
 
     gain: ClassVar[float] = 1.0
     shift: ClassVar[float] = 0.0
-    keeps_first: ClassVar[bool] = True
-    """Whether the core's derivative is kept for the backward pass, rather than computed again by `first_of`."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -50,11 +48,6 @@ class Activation(nn.Module, abc.ABC):
         """The core and its derivative at `u`, whose memory may be taken."""
 
     @staticmethod
-    def first_of(core: Tensor) -> Tensor:
-        """The derivative from the core's value, for those that do not keep it."""
-        raise NotImplementedError("An activation with keeps_first = False needs first_of(core), the core's derivative.")
-
-    @staticmethod
     @abc.abstractmethod
     def times_second_(x: Tensor, core: Tensor, first: Tensor) -> Tensor:
         """Multiply `x` by the core's second derivative, in place, given its value and its derivative."""
@@ -76,7 +69,6 @@ class Tanh(Activation):
 
     gain = 2.0
     shift = -1.0
-    keeps_first = False
 
     @property
     def factor(self) -> Tensor:
@@ -89,15 +81,10 @@ class Tanh(Activation):
         return torch.sigmoid(u)
 
     @staticmethod
-    def first_of(core: Tensor) -> Tensor:
-        """Of the sigmoid, s - s^2."""
-        return torch.addcmul(core, core, core, value=-1)
-
-    @staticmethod
     def core_and_first_(u: Tensor) -> tuple[Tensor, Tensor]:
-        """The sigmoid and its derivative."""
+        """The derivative is s - s^2."""
         core = u.sigmoid_()
-        return core, Tanh.first_of(core)
+        return core, torch.addcmul(core, core, core, value=-1)
 
     @staticmethod
     def times_second_(x: Tensor, core: Tensor, first: Tensor) -> Tensor:
@@ -116,23 +103,16 @@ class Tanh(Activation):
 class ReLU(Activation):
     """Rectified linear unit, Kaiming initialisation."""
 
-    keeps_first = False
-
     @staticmethod
     def core(u: Tensor) -> Tensor:
         """max(u, 0)."""
         return torch.relu(u)
 
     @staticmethod
-    def first_of(core: Tensor) -> Tensor:
-        """1 where u > 0, otherwise 0."""
-        return (core > 0).to(core.dtype)
-
-    @staticmethod
     def core_and_first_(u: Tensor) -> tuple[Tensor, Tensor]:
-        """max(u, 0) and its derivative."""
-        core = u.relu_()
-        return core, ReLU.first_of(core)
+        """The derivative is 1 where u > 0, otherwise 0."""
+        first = (u > 0).to(u.dtype)
+        return u.relu_(), first
 
     @staticmethod
     def times_second_(x: Tensor, core: Tensor, first: Tensor) -> Tensor:

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torchmetrics import WeightedMeanAbsolutePercentageError
 
 from hno.games import Game, games
-from hno.losses import LossTerm, Norm, Scales
+from hno.losses import LossTerm, Norm, Scales, used_weights
 from hno.operators.deeponet import DeepONet, median_of, nets
 from hno.operators.inputs import distinct_types, ego_views, tables
 from hno.operators.value_gradient import compiled
@@ -100,17 +100,7 @@ class ValueOperator(L.LightningModule, abc.ABC):
             raise ValueError(f"loss.hardest is a share in (0, 1]; got {hardest!r}.")
         self.balance, self.hardest = balance, hardest
         self.losses = nn.ModuleDict({name: term() for name, term in self.terms.items()})
-        given = {
-            name: float(w) for name, w in (weights or dict.fromkeys(self.terms, 1.0)).items() if name in self.terms
-        }
-        self.weights = {
-            name: w for name, w in given.items() if not (exact_terminal and self.terms[name].met_by_exact_terminal)
-        }
-        if not all(map(_is_weight, given.values())) or not any(self.weights.values()):
-            raise ValueError(
-                f"Loss weights must be finite, not negative and not all 0; got {given}. With an exact terminal "
-                "condition the boundary does not count."
-            )
+        self.weights = used_weights(self.terms, weights, exact_terminal=exact_terminal)
         players, states = game.players, game.state_dim
         self.has_roles = len(set(game.roles)) > 1
         self.register_buffer("roles", torch.tensor(game.roles), persistent=False)
@@ -294,7 +284,3 @@ class ValueOperator(L.LightningModule, abc.ABC):
         if self.optimizer is None:
             raise ValueError("This operator was built without an optimizer; pass one to train it.")
         return self.optimizer(self.net.parameters())
-
-
-def _is_weight(number: float) -> bool:
-    return math.isfinite(number) and number >= 0

@@ -43,9 +43,9 @@ class _Block(NamedTuple):
     inputs: list[Tensor]
     """h, each (R, inputs), and the last layer's output."""
     firsts: list[Tensor]
-    """Derivatives of the core; empty where the activation does not keep them."""
+    """Derivatives of the core."""
     above: list[Tensor]
-    """dV / d output of the layer; times the core's derivative it is dV / d argument of the core."""
+    """dV / d output of the layer; times `firsts` it is dV / d argument of the core."""
 
 
 class Kernels(NamedTuple):
@@ -115,7 +115,9 @@ class _ValueGradient(torch.autograd.Function):
         y, which, coefficient, *flat = ctx.saved_tensors
         forward, backward = ctx.kernels
         layers = _layers(flat)
-        sums = [part.new_zeros(part.t().shape).t() for part in (coefficient, *flat)]  # in BLAS's order
+        sums = [
+            part.new_zeros(part.t().shape).t() for part in (coefficient, *flat)
+        ]  # for the same reason as in _forward
         parts = zip(_split(y, which), *(part.split(_block(y)) for part in cotangents), strict=True)
         for number, ((rows, index), dvalue, dgradient) in enumerate(parts):
             kept = ctx.blocks[number] if ctx.blocks else forward(ctx.activation, rows, coefficient[index], layers)[2]
@@ -135,9 +137,8 @@ def _forward(
     above = [coefficient]
     for (weight, _), first in zip(reversed(layers[1:]), reversed(firsts[1:]), strict=True):
         above.append((above[-1] * first) @ weight)
-    gradient = (layers[0].weight.mT @ (above[-1] * firsts[0]).mT).mT  # several times faster than with few columns
-    kept = firsts if activation.keeps_first else []
-    return torch.linalg.vecdot(inputs[-1], coefficient), gradient, _Block(inputs, kept, above[::-1])
+    gradient = (layers[0].weight.mT @ (above[-1] * firsts[0]).mT).mT  # BLAS is slow where a product has few columns
+    return torch.linalg.vecdot(inputs[-1], coefficient), gradient, _Block(inputs, firsts, above[::-1])
 
 
 def _backward(
@@ -149,10 +150,9 @@ def _backward(
     sums: Sequence[Tensor],
 ) -> Tensor:
     """Add the derivatives in the layers to `sums`; return those in each row's coefficient, (R, width)."""
-    firsts = block.firsts if activation.keeps_first else list(map(activation.first_of, block.inputs[1:]))
     curved, dabove = [], dgradient
     for k, (weight, _) in enumerate(layers):  # along the gradient's own computation, backwards: from the inputs up
-        above, first = block.above[k], firsts[k]
+        above, first = block.above[k], block.firsts[k]
         dbelow = dabove @ weight.mT
         sums[2 * k].addmm_((above * first).mT, dabove)
         dabove = dbelow * first
@@ -161,7 +161,7 @@ def _backward(
     dcoefficient = dabove.addcmul_(rate, block.inputs[-1])
     dh = rate * block.above[-1]
     for k in reversed(range(len(layers))):  # then along the value's
-        du = curved[k].addcmul_(dh, firsts[k])
+        du = curved[k].addcmul_(dh, block.firsts[k])
         sums[2 * k].addmm_(du.mT, block.inputs[k])
         sums[2 * k + 1].add_(du.sum(0))
         if k > 0:

@@ -231,7 +231,7 @@ def watch(monkeypatch: pytest.MonkeyPatch) -> Watch:
         def forward(*arguments: Any) -> Any:
             alive.append(living())
             found = original(*arguments)
-            seen.append(weakref.ref(found[2].inputs[-1]))
+            seen.append(weakref.ref(found[2].firsts[0]))
             return found
 
         with monkeypatch.context() as patch:
