@@ -19,10 +19,10 @@ from recipe_sets import SUITES
 from recipes import starts
 from torch import Tensor
 
+from hno.control.rollout import Policy, rollout
 from hno.evaluation.metrics import clopper_pearson
-from hno.evaluation.rollout import Policy, rollout
 from hno.operators import ValueOperator
-from hno.operators.checkpoint import load_operator
+from hno.training.checkpoint import load_operator
 from hno.types import Field, Points
 
 Choice = Callable[[Tensor, Tensor], Tensor]

@@ -17,10 +17,10 @@ from collections.abc import Callable
 
 import torch
 
-from hno.evaluation.rollout import rollout
+from hno.control.rollout import rollout
 from hno.games import make
 from hno.operators import operators
-from hno.operators.checkpoint import OperatorPolicy
+from hno.training.checkpoint import OperatorPolicy
 
 
 def seconds(run: Callable[[], object]) -> float:

@@ -6,7 +6,7 @@ import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from hno.evaluation.rollout import Disturbance
+from hno.control.rollout import Disturbance
 
 GRID5 = [(float(a), float(b)) for a, b in itertools.product(range(1, 6), repeat=2)]
 GRID9 = [(a / 2, b / 2) for a, b in itertools.product(range(2, 11), repeat=2)]

@@ -30,13 +30,13 @@ from rich.table import Table
 from hno.cli.config import config_dir, register_plugins
 from hno.cli.results import Results, config_hash
 from hno.cli.train import fit
+from hno.control.rollout import rollout
 from hno.data.labels import Request, default_cache, safe_labels_for
 from hno.data.trust import safe
 from hno.evaluation.metrics import clopper_pearson
-from hno.evaluation.rollout import rollout
-from hno.evaluation.validation import Starts, starts_of
 from hno.games import make
-from hno.operators.checkpoint import OperatorPolicy, load_policy
+from hno.training.checkpoint import OperatorPolicy, load_policy
+from hno.training.validation import Starts, starts_of
 from hno.types import part
 
 Cases = dict[str, tuple[Starts, list[int]]]

@@ -20,7 +20,7 @@ from rich.table import Table
 
 from hno.data.labels import Request, default_cache, labels_for
 from hno.evaluation.residuals import REGIONS, residual_table
-from hno.operators.checkpoint import load_operator
+from hno.training.checkpoint import load_operator
 
 UNSEEN = (2.0, 2.0)
 

@@ -17,13 +17,14 @@ LEVELS = (
     {"pontryagin"},
     {"losses", "data"},
     {"operators"},
-    {"evaluation"},
+    {"control"},
+    {"training", "evaluation"},
     {"report"},
     {"hno"},
     {"cli"},
 )
 """Who may import whom: a part imports itself and the levels before its own."""
-STRANGERS = {("data", "operators"), ("operators", "data")}
+STRANGERS = {("data", "operators"), ("operators", "data"), ("training", "evaluation"), ("evaluation", "training")}
 """Parts that meet in the command line only."""
 
 

@@ -14,11 +14,11 @@ from hno.cli.results import plain
 from hno.data import GameData
 from hno.data.curriculum import Curriculum
 from hno.data.labels import Report, default_cache
-from hno.evaluation.callbacks import StopOnDivergence, checkpoints
 from hno.games import Game, make
 from hno.losses import losses
 from hno.operators import ValueOperator, operators
-from hno.operators.optimizers import make_optimizer
+from hno.training.divergence import StopOnDivergence, checkpoints
+from hno.training.optimizers import make_optimizer
 
 SIZES = (
     "operator.width", "operator.depth", "data.trajectories", "data.validation", "data.workers", "trainer.max_steps",

@@ -21,14 +21,14 @@ from hno.cli.results import Results, config_hash, plain, write_json
 from hno.cli.sections import check_sections, run_sections
 from hno.cli.starts import solve_starts
 from hno.cli.summary import report, show
+from hno.control.rollout import Disturbance, control_steps, rollout
 from hno.evaluation.closed_loop import TypeRow, classify, collided, play, tabulate
 from hno.evaluation.comparison import check_same_game, compare
 from hno.evaluation.episodes import EPISODES, episodes
-from hno.evaluation.rollout import Disturbance, control_steps, rollout
 from hno.games import Game
 from hno.games.grid import parse_types
-from hno.operators.checkpoint import OperatorPolicy, load_operator
 from hno.report.picture import PlotsMissingError, rollout_picture, typical
+from hno.training.checkpoint import OperatorPolicy, load_operator
 from hno.types import Extremal, Trajectory
 
 log = logging.getLogger(__name__)

@@ -12,11 +12,11 @@ from rich.table import Table
 
 from hno.cli.checks import whole_number
 from hno.cli.tables import types
-from hno.evaluation.receding_horizon import RecedingHorizon
-from hno.evaluation.rollout import Disturbance
+from hno.control.receding_horizon import RecedingHorizon
+from hno.control.rollout import Disturbance
 from hno.evaluation.yardstick import compare, latency, safe_starts
-from hno.operators.checkpoint import OperatorPolicy
 from hno.report.words import interval, number, percent
+from hno.training.checkpoint import OperatorPolicy
 from hno.types import Extremal
 
 log = logging.getLogger(__name__)

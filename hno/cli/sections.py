@@ -16,11 +16,11 @@ from hno.cli.online import check_online, online_section, show_online
 from hno.cli.results import Results
 from hno.cli.starts import solve_starts
 from hno.cli.tables import show_residuals, show_robustness
+from hno.control.rollout import Disturbance
 from hno.evaluation.residuals import residual_table
 from hno.evaluation.robustness import Condition, read_conditions, robustness_table
-from hno.evaluation.rollout import Disturbance
 from hno.games import Game
-from hno.operators.checkpoint import OperatorPolicy
+from hno.training.checkpoint import OperatorPolicy
 from hno.types import Extremal
 
 Types = Sequence[tuple[float, ...]]

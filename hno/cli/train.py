@@ -27,13 +27,13 @@ from hno.cli.summary import report, show
 from hno.data import GameData
 from hno.data.labels import Request, safe_labels_for
 from hno.data.trust import safe, summary
-from hno.evaluation.callbacks import DivergedError
-from hno.evaluation.validation import BEST, ClosedLoopValidation
 from hno.games import Game
 from hno.games.grid import parse_types
 from hno.losses import Scales
-from hno.operators.checkpoint import check_resumable, load_policy
-from hno.operators.polish import polish
+from hno.training.checkpoint import check_resumable, load_policy
+from hno.training.divergence import DivergedError
+from hno.training.polish import polish
+from hno.training.validation import BEST, ClosedLoopValidation
 from hno.types import Extremal, part
 
 log = logging.getLogger(__name__)

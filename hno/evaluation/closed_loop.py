@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 from torchmetrics import WeightedMeanAbsolutePercentageError
 
+from hno.control.rollout import Disturbance, Policy, rollout
 from hno.data.rows import rows_of
 from hno.evaluation.metrics import CollisionRate, Quantiles, SaturatedShare, clopper_pearson
-from hno.evaluation.rollout import Disturbance, Policy, rollout
 from hno.games import Game
 from hno.types import Extremal, Field, Points, Status, Trajectory
 

@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 
 import torch
 
+from hno.control.disturbance import pushed_states
+from hno.control.rollout import Disturbance, Policy
 from hno.evaluation.closed_loop import classify, collided, excess_costs, median, play
-from hno.evaluation.disturbance import pushed_states
 from hno.evaluation.metrics import clopper_pearson
-from hno.evaluation.rollout import Disturbance, Policy
 from hno.games import Game
 from hno.registry import unknown_name
 from hno.types import Extremal

@@ -10,10 +10,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from hno.control.receding_horizon import RecedingHorizon
+from hno.control.rollout import Disturbance, Policy, rollout
 from hno.evaluation.closed_loop import classify, collided, excess_costs, median
 from hno.evaluation.metrics import clopper_pearson
-from hno.evaluation.receding_horizon import RecedingHorizon
-from hno.evaluation.rollout import Disturbance, Policy, rollout
 from hno.games import Game
 from hno.types import Extremal, Trajectory, join, part
 

@@ -263,7 +263,7 @@ class ValueOperator(L.LightningModule, abc.ABC):
         self.log_dict({"val/value_error": self.value_error, "val/costate_error": self.costate_error})
 
     def spec(self) -> dict[str, Any]:
-        """What `hno.operators.checkpoint` needs to rebuild the operator, plain containers."""
+        """What `hno.training.checkpoint` needs to rebuild the operator, plain containers."""
         return {
             "format": SPEC_FORMAT,
             **self.names(),

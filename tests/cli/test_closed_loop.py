@@ -10,12 +10,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from hno.control.rollout import Disturbance
 from hno.data import GameData
 from hno.data.trust import safe
 from hno.evaluation import closed_loop
-from hno.evaluation.rollout import Disturbance
-from hno.evaluation.validation import ClosedLoopValidation, Score
 from hno.operators import ValueOperator
+from hno.training.validation import ClosedLoopValidation, Score
 from hno.types import Batch, Extremal, Trajectory
 from tests.cli.conftest import SMOKE, Command, Outcome, refused
 from tests.cli.test_train import equal, power_cut, weights

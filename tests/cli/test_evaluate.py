@@ -12,9 +12,9 @@ from torch import Tensor
 import hno
 from hno.cli.config import config_dir
 from hno.cli.evaluate import types_to_evaluate
+from hno.control.rollout import Policy
 from hno.evaluation import closed_loop
 from hno.evaluation.residuals import REGIONS
-from hno.evaluation.rollout import Policy
 from hno.games import Game, make
 from hno.games.base import ExtrapolationWarning
 from hno.operators import operators

@@ -10,7 +10,7 @@ from omegaconf import OmegaConf
 from rich.console import Console
 
 from hno.cli.online import online_section, show_online
-from hno.operators.checkpoint import load_policy
+from hno.training.checkpoint import load_policy
 from tests.cli.conftest import Command, refused
 from tests.fakes import fake_labels
 

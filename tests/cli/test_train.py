@@ -17,10 +17,10 @@ from hno.cli import evaluate
 from hno.cli.evaluate import draw
 from hno.cli.results import Results
 from hno.cli.train import label_statistics
-from hno.evaluation.callbacks import StopOnDivergence
 from hno.evaluation.closed_loop import TypeRow
 from hno.games import make
 from hno.operators.deeponet import nets
+from hno.training.divergence import StopOnDivergence
 from hno.types import Status, join, part
 from tests.cli.conftest import SMOKE, Command, Outcome
 from tests.fakes import fake_labels

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from hno.cli.summary import remarks, show, verdict
+from hno.control.rollout import Disturbance, rollout
 from hno.evaluation.closed_loop import TypeRow, classify, collision_table
-from hno.evaluation.rollout import Disturbance, rollout
 from hno.report.words import percent
 from hno.types import Extremal, Field, Points, Status
 from tests.fakes import fake_labels

@@ -10,9 +10,9 @@ from rich.console import Console
 from torch import Tensor
 
 from hno.cli.tables import show_robustness
+from hno.control.rollout import Disturbance
 from hno.evaluation.closed_loop import collision_table
 from hno.evaluation.robustness import Condition, read_conditions, robustness_table
-from hno.evaluation.rollout import Disturbance
 from hno.games import make
 from hno.types import Extremal
 from tests.fakes import fake_labels

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from hno.evaluation.rollout import Disturbance, rollout
+from hno.control.rollout import Disturbance, rollout
 from hno.evaluation.yardstick import compare, driven, latency, safe_starts
 from hno.pontryagin import solve
 from hno.types import Extremal, Status

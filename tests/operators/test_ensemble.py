@@ -11,8 +11,8 @@ import pytest
 import torch
 
 from hno.operators import ValueOperator
-from hno.operators.checkpoint import load_operator
 from hno.operators.deeponet import DeepONet, nets
+from hno.training.checkpoint import load_operator
 from hno.types import Batch, Field, Labels, Points, Sample
 from tests.operators.conftest import GAMES, MakeOperator, random_points
 

@@ -10,8 +10,8 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from hno.operators.checkpoint import CheckpointError, check_resumable, load_operator
 from hno.operators.inputs import distinct_types, ego_views, tables
+from hno.training.checkpoint import CheckpointError, check_resumable, load_operator
 from hno.types import Field, Labels, Points, Sample, Types
 from tests.operators.conftest import ACTIVATIONS, GAMES, MakeOperator, random_points
 

@@ -8,8 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from hno.evaluation.disturbance import believed, normal, state_push
-from hno.evaluation.rollout import Disturbance, Policy, rollout
+from hno.control.disturbance import believed, normal, state_push
+from hno.control.rollout import Disturbance, Policy, rollout
 from hno.games import Game, make
 from hno.types import Trajectory
 from tests.walkers import Walkers

@@ -11,7 +11,7 @@ from hno.operators import ValueOperator
 from hno.operators.inputs import distinct_types
 from hno.types import Batch
 from tests.operators.conftest import GAMES, MakeOperator
-from tests.operators.test_training import random_batch
+from tests.training.test_training import random_batch
 
 WAITING = ("_local_scalar_dense", "nonzero", "_unique2", "unique_dim", "masked_select", "equal", "is_nonzero")
 """Operators of ATen that read from a device."""

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from hno.operators import ValueOperator
 from hno.operators.inputs import distinct_types
-from hno.operators.polish import polish
+from hno.training.polish import polish
 from hno.types import Batch, Labels, Sample
 from tests.operators.conftest import ACTIVATIONS, MakeOperator, random_points
 

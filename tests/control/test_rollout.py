@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from hno.evaluation.rollout import Disturbance, Policy, rollout
+from hno.control.rollout import Disturbance, Policy, rollout
 from hno.games import Game, make
 from hno.types import Extremal, Trajectory
 from tests.walkers import Walkers

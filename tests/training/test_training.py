@@ -13,8 +13,8 @@ from hno.losses import Scales, hji_residual
 from hno.losses.hji import Boundary
 from hno.operators import ValueOperator, operators
 from hno.operators.inputs import distinct_types
-from hno.operators.optimizers import OPTIMIZERS, SCHEDULES, make_optimizer, muon
 from hno.registry import UnknownNameError
+from hno.training.optimizers import OPTIMIZERS, SCHEDULES, make_optimizer, muon
 from hno.types import Batch, Labels, Points, Sample
 from tests.operators.conftest import ACTIVATIONS, MakeOperator, random_points
 

@@ -6,8 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from hno.evaluation.receding_horizon import ONLINE, RecedingHorizon
-from hno.evaluation.rollout import Disturbance, rollout
+from hno.control.receding_horizon import ONLINE, RecedingHorizon
+from hno.control.rollout import Disturbance, rollout
 from hno.games import make
 from hno.pontryagin import Solver
 from hno.pontryagin.newton import Newton

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import nn
 
-from hno.evaluation.callbacks import ERROR, DivergedError, StopOnDivergence
+from hno.training.divergence import ERROR, DivergedError, StopOnDivergence
 
 ADVICE = r"the training diverged\. Lower optimizer\.lr or set trainer\.gradient_clip_val\."
 

@@ -12,8 +12,8 @@ import lightning as L
 import torch
 from torch import Tensor
 
+from hno.control.rollout import rollout
 from hno.data import GameData
-from hno.evaluation.rollout import rollout
 from hno.operators import ValueOperator
 from hno.types import Extremal, Points, Trajectory, part
 

@@ -14,8 +14,8 @@ import hno
 from hno.games import make
 from hno.games.base import ExtrapolationWarning
 from hno.operators import operators
-from hno.operators.checkpoint import CheckpointError, OperatorPolicy, check_resumable, load_operator, read_checkpoint
 from hno.registry import UnknownNameError
+from hno.training.checkpoint import CheckpointError, OperatorPolicy, check_resumable, load_operator, read_checkpoint
 from hno.types import Field, Points
 from tests.operators.conftest import GAMES, MakeOperator, random_points
 

@@ -11,15 +11,15 @@ import pytest
 import torch
 from torch import Tensor
 
+from hno.control.rollout import rollout
 from hno.data import GameData
 from hno.data.curriculum import Curriculum
-from hno.evaluation import validation as module
 from hno.evaluation.closed_loop import collision_table
-from hno.evaluation.rollout import rollout
-from hno.evaluation.validation import BEST, ClosedLoopValidation, Score, score, starts_of
 from hno.games import Game, make
 from hno.operators import ValueOperator, operators
-from hno.operators.checkpoint import OperatorPolicy
+from hno.training import validation as module
+from hno.training.checkpoint import OperatorPolicy
+from hno.training.validation import BEST, ClosedLoopValidation, Score, score, starts_of
 from hno.types import Extremal, Field, Points, Trajectory, join
 from tests.fakes import fake_labels
 from tests.walkers import Walkers

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from hno.evaluation.disturbance import Disturbance, believed, control_noise, normal, state_push
+from hno.control.disturbance import Disturbance, believed, control_noise, normal, state_push
 from hno.games import Game
 from hno.games.kinematics import separation
 from hno.pontryagin.integrate import runge_kutta

@@ -1,0 +1,1 @@
+"""Controllers, and the simulation that plays them."""

@@ -1,0 +1,1 @@
+"""From an operator, loss terms and data to a trained operator."""
