@@ -32,13 +32,13 @@ class HJIResidual(LossTerm):
         return hji_residual(game, sample.points, field)
 
     def scale(self, game: Game, sample: Sample, scales: Scales) -> Tensor:
-        """Size of values per horizon, plus the penalty at each point, (B, P).
+        """Size of values per horizon, plus the cost of the state at each point, (B, P).
 
-        Without the penalty, points deep inside the violation set, where it is thousands of times larger and where no
+        Without it, points deep inside the violation set, where it is thousands of times larger and where no
         equilibrium goes, would make up the whole loss.
         """
         points = sample.points
-        return scales.value / game.horizon + game.penalty(game.constraint(points.x, points.theta))
+        return scales.value / game.horizon + game.uncontrolled_cost(points.x, points.theta).abs()
 
 
 @final
