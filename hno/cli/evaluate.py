@@ -114,7 +114,7 @@ def types_to_evaluate(
         own = [theta for theta in unseen if len(theta) == game.players]
         inside = [theta for theta in own if bool(game.type_box.contains(torch.tensor(theta)))]
         return list(dict.fromkeys([*policy.types, *game.validate_types(inside)]))
-    return parse_types(game, text, also=("default",))
+    return parse_types(game, text, key="theta", also=("default",))
 
 
 def solve_tests(

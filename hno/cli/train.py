@@ -167,7 +167,7 @@ def validation_labels(config: DictConfig, data: GameData, results: Results) -> l
     choice, clearance = config.validation, config.evaluation.clearance
     found = data.held_out()
     if choice.types is not None:
-        types = parse_types(data.game, choice.types)
+        types = parse_types(data.game, choice.types, key="validation.types")
         requests = [Request(theta, choice.starts, choice.seed, "validation") for theta in types]
         found, seconds = safe_labels_for(
             data.game,
@@ -193,5 +193,5 @@ def _take_over(best: Path | None, to: Path) -> None:
 def check_validation(game: Game, choice: DictConfig) -> None:
     """Raise ValueError for entries that make no validation of the game."""
     if choice.types is not None:
-        parse_types(game, choice.types)
+        parse_types(game, choice.types, key="validation.types")
         whole_number("validation.starts", choice.starts, 1)

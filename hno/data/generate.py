@@ -115,7 +115,7 @@ def run(options: DictConfig) -> None:
     cache = default_cache() if options.cache is None else Path(str(options.cache))
     requests = [
         Request(theta, options.n, options.seed, options.split, float(options.widen))
-        for theta in parse_types(game, str(options.theta))
+        for theta in parse_types(game, str(options.theta), key="theta")
     ]
     console = Console()
     with progress_report(console) as report:
