@@ -31,7 +31,7 @@ USAGE = """Solve open-loop equilibria from random start states and keep them, wi
     python -m hno.data.generate game=narrow_road theta=grid5 n=1000
 
 game       name of a registered game
-theta      player types: grid5, grid9, or a list such as "1,1;2.5,4"
+theta      player types: corners, grid5 (N values each), or a list such as "1,1;2.5,4"
 n          start states per type; more of them extend a set that is there
 seed       of the start states (0)
 split      what they are for: train, or test for evaluations (train)

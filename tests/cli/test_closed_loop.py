@@ -110,14 +110,17 @@ def test_validation_starts_of_chosen_types(command: Command, monkeypatch: pytest
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (("validation.types=grid7",), "theta must be one of grid5, grid9, or a list such as '1,1;2.5,4'; got 'grid7'"),
-        (("validation.types=default",), "theta must be one of grid5, grid9"),
+        (
+            ("validation.types=grid",),
+            "validation.types must be one of corners, gridN (as in grid5), or a list such as '1,1;2.5,4'; got 'grid'",
+        ),
+        (("validation.types=default",), "validation.types must be one of corners, gridN"),
         (("validation.types='1,1;2'",), "2 finite numbers, one per player; got [2.0]"),
         (("validation.types='1,nan'",), "2 finite numbers"),
         (("validation.types='1,inf'",), "2 finite numbers"),
-        (("validation.types=''",), "theta must be one of"),
+        (("validation.types=''",), "validation.types must be one of"),
         (("validation.types=5",), "2 finite numbers, one per player; got [5.0]"),
-        (("validation.types=[[1,1]]",), "or a list such as '1,1;2.5,4'; got [[1, 1]]"),
+        (("validation.types=[[1,1,1]]",), "2 finite numbers, one per player; got [1, 1, 1]"),
         (
             ("validation.types=grid5", "validation.starts=0"),
             "validation.starts must be a whole number of at least 1; got 0",

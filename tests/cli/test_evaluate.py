@@ -70,14 +70,14 @@ def test_types_outside_the_range_warn(random_checkpoint: Path) -> None:
 @pytest.mark.parametrize(
     ("theta", "message"),
     [
-        ("everything", "default, grid5, grid9"),
-        ("grid7", "grid5, grid9"),
+        ("everything", "theta must be one of default, corners, gridN"),
+        ("grid", "corners, gridN"),
         ("1,1;2", "2 finite numbers"),
         ("1", "2 finite numbers"),
         ("1,1,1", "2 finite numbers"),
         ("1,nan", "2 finite numbers"),
         ("1,inf", "2 finite numbers"),
-        ("1,1;", "grid5, grid9"),
+        ("1,1;", "corners, gridN"),
     ],
 )
 def test_impossible_types(command: Command, random_checkpoint: Path, theta: str, message: str) -> None:
