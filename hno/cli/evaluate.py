@@ -28,7 +28,7 @@ from hno.evaluation.sections import Evaluation
 from hno.games import Game
 from hno.games.grid import parse_types
 from hno.report.picture import PlotsMissingError, rollout_picture, typical
-from hno.training.checkpoint import OperatorPolicy, load_operator
+from hno.training.checkpoint import LearnedPolicy, load_policy
 from hno.types import Extremal
 
 log = logging.getLogger(__name__)
@@ -73,26 +73,27 @@ def checkpoints_of(config: DictConfig) -> list[str]:
 
 def _run(config: DictConfig, results: Results) -> None:
     paths = checkpoints_of(config)
-    policies = [OperatorPolicy(load_operator(path, config.expected_game)) for path in paths]
+    policies = [load_policy(path, config.expected_game) for path in paths]
     game = policies[0].game
-    results.update(**policies[0].operator.names(), seed=policies[0].operator.seed)
+    results.update(**policies[0].names(), seed=policies[0].provenance.seed)
     check_same_game(paths, [policy.game for policy in policies])
     check_evaluation(game, config)
     chosen = [types_to_evaluate(config.theta, policy, config.unseen) for policy in policies]
     types = list(dict.fromkeys(theta for own in chosen for theta in own))
-    solve = TestLabels(game, types, config, cache_folder(config.cache), config.workers)
+    settings = plain(config)
+    solve = TestLabels(game, types, settings, cache_folder(config.cache), config.workers)
     evaluations = [
-        evaluation_of(path, policy, types, config, solve) for path, policy in zip(paths, policies, strict=True)
+        evaluation_of(path, policy, types, settings, solve) for path, policy in zip(paths, policies, strict=True)
     ]
     for evaluation in evaluations:
         check_sections(evaluation)
     labels = solve_tests(solve, evaluations[0], results)
     models, played = list[dict[str, Any]](), list[Evaluation]()
-    for evaluation in evaluations:
+    for policy, evaluation in zip(policies, evaluations, strict=True):
         log.info("evaluation of %s", evaluation.name)
         found, table = (assess if models else evaluate_policy)(evaluation, labels, results)
         played.append(found)
-        names = {**evaluation.operator.names(), "seed": evaluation.operator.seed}
+        names = {**policy.names(), "seed": policy.provenance.seed}
         models.append({"checkpoint": evaluation.name, **names, "table": table})
         for name, content in run_sections(found, results):
             models[-1][name] = content
@@ -103,7 +104,7 @@ def _run(config: DictConfig, results: Results) -> None:
 
 
 def types_to_evaluate(
-    text: str, policy: OperatorPolicy, unseen: Sequence[Sequence[float]] = ()
+    text: str, policy: LearnedPolicy, unseen: Sequence[Sequence[float]] = ()
 ) -> list[tuple[float, ...]]:
     """Player types from "default", a named grid, or a list such as "1,1;2.5,4".
 
@@ -116,7 +117,7 @@ def types_to_evaluate(
     if text == "default":
         own = [theta for theta in unseen if len(theta) == game.players]
         inside = [theta for theta in own if bool(game.type_box.contains(torch.tensor(theta)))]
-        return list(dict.fromkeys([*policy.operator.seen_types, *game.validate_types(inside)]))
+        return list(dict.fromkeys([*policy.types, *game.validate_types(inside)]))
     return parse_types(game, text, also=("default",))
 
 
@@ -139,7 +140,8 @@ def evaluate_policy(evaluation: Evaluation, labels: Sequence[Extremal], results:
     write_json(folder / EPISODES, episodes(game, found.played, labels, found.clearance))
     conditions = {name: found.options[name] for name in ("clearance", "dt", "widen", "noise", "delay")}
     results.update(**conditions, constraint_unit=game.constraint_unit, table=table, episodes=EPISODES)
-    draw(found, folder / "rollout.png")
+    title = " / ".join(str(results.content[name]) for name in ("game", "operator", "activation"))
+    draw(found, folder / "rollout.png", title)
     return found, table
 
 
@@ -154,14 +156,13 @@ def assess(evaluation: Evaluation, labels: Sequence[Extremal], results: Results)
     return found, table
 
 
-def draw(evaluation: Evaluation, path: Path, episodes: int = 15) -> None:
+def draw(evaluation: Evaluation, path: Path, title: str, episodes: int = 15) -> None:
     """Draw a typical episode from the first starts of the first type; without matplotlib, say so."""
     labels, game = evaluation.labels[0], evaluation.game
     starts, theta = labels.x[:episodes, 0].float(), labels.theta[:episodes].float()
     played = rollout(game, evaluation.policy, starts, theta, evaluation.dt)
-    names = evaluation.operator.names()
     try:
-        rollout_picture(game, played, theta, path, " / ".join(names.values()), typical(played))
+        rollout_picture(game, played, theta, path, title, typical(played))
     except PlotsMissingError as error:
         log.info("No picture: %s", error)
 
@@ -174,6 +175,6 @@ def check_evaluation(game: Game, settings: DictConfig) -> None:
         whole_number("workers", settings.workers, 1)
     for name in ("clearance", "dt"):
         finite_number(name, settings[name])
-    table_condition(game, settings)
+    table_condition(game, plain(settings))
     flag("safe", settings.safe)
     control_steps(game, settings.dt)
