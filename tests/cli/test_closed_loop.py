@@ -131,7 +131,7 @@ def test_validation_starts_of_chosen_types(command: Command, monkeypatch: pytest
         (("validation.stop=true",), "Known: seed, starts, stop_when_safe, types"),
         (("loss.hardest=0",), "loss.hardest is a share in (0, 1]; got 0"),
         (("loss.hardest=1.5",), "loss.hardest is a share in (0, 1]; got 1.5"),
-        (("sampler.rollout=-1",), "Sampler shares must be nonnegative numbers for box, band, labels, rollout"),
+        (("sampler.rollout=-1",), "Shares of the sampler's sources must be finite, not negative"),
         (("sampler=roll-out",), "Did you mean 'rollout'?"),
         (("optimizer=moun",), "Did you mean 'muon'?"),
         (("optimizer.schedule=liner",), "Did you mean 'linear'?"),

@@ -152,9 +152,8 @@ def test_without_a_safe_start_every_section_says_so(command: Command, random_che
 
 def other(checkpoint: Path, folder: Path, game: str = "narrow_road", seed: int = 1, **constants: float) -> Path:
     """Another operator with random weights."""
-    return save_random(
-        checkpoint.parent.parent / folder / "last.ckpt", make(game, **constants), "sno", seed, (5.0, 5.0)
-    )
+    path = checkpoint.parent.parent / folder / "last.ckpt"
+    return save_random(path, make(game, **constants), "sno", seed, also=5.0)
 
 
 def test_results_hold_the_configuration(command: Command, random_checkpoint: Path) -> None:
