@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import shutil
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -28,12 +27,14 @@ from hno.cli.config import run_command
 from hno.cli.evaluate import check_evaluation, evaluate_policy, solve_tests
 from hno.cli.logs import StepLines, finish_wandb, label_progress, loggers, progress_bar, send_lightning_to_hydra
 from hno.cli.media import publish
-from hno.cli.ntk import check_rows, ntk_section
 from hno.cli.results import Results, config_hash, plain
+from hno.cli.sections import evaluation_of, run_sections
+from hno.cli.starts import TestLabels
 from hno.cli.summary import report, show
 from hno.data import GameData
+from hno.data.certificates import safe, summary
 from hno.data.labels import Request, safe_labels_for
-from hno.data.trust import safe, summary
+from hno.evaluation.kernels import check_rows
 from hno.games import Game
 from hno.games.grid import parse_types
 from hno.operators import make_operator
@@ -95,16 +96,16 @@ def _run(config: DictConfig, folder: Path, results: Results) -> None:
     check_evaluation(game, settings)
     unseen = game.validate_types(settings.types)
     if settings.ntk:
-        check_rows(make_operator(game, build_architecture(config)), settings)
+        check_rows(make_operator(game, build_architecture(config)), settings.ntk_rows)
     fitted = train_operator(config, folder, results)
     policy = load_policy(fitted.checkpoint)
     types = list(dict.fromkeys([*policy.types, *unseen]))
-    test = solve_tests(game, types, settings, cache_folder(config.data.cache), config.data.workers, results)
-    evaluate_policy(policy, test, settings, results)
-    if settings.ntk:
-        began = time.perf_counter()
-        results.update(ntk=ntk_section(policy, test, settings))
-        results.time("ntk", time.perf_counter() - began)
+    chosen = plain(settings)
+    solve = TestLabels(game, types, chosen, cache_folder(config.data.cache), config.data.workers)
+    evaluation = evaluation_of(results.content["checkpoint"], policy, types, chosen, solve)
+    assessed, _ = evaluate_policy(evaluation, solve_tests(solve, evaluation, results), results)
+    for name, content in run_sections(assessed, results):
+        results.update(**{name: content})
     results.update(status="finished")
     publish(fitted.trainer.loggers, results.content, folder, fitted.trainer.global_step)
 
