@@ -172,7 +172,7 @@ def sample_points(
     game: Game, theta: Tensor, sampler: Sampler, known: Known, window: float, generator: torch.Generator
 ) -> Points:
     """Collocation points of given types (B, P) from a mixture of sources."""
-    weights = torch.tensor([share.weight for share in sampler.values()])
+    weights = torch.tensor([float(share.weight) for share in sampler.values()])
     chosen = torch.multinomial(weights, len(theta), replacement=True, generator=generator)
     tau, x = theta.new_empty(len(theta)), theta.new_empty(len(theta), game.players, game.state_dim)
     for number, share in enumerate(sampler.values()):

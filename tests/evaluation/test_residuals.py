@@ -86,6 +86,9 @@ def operator() -> ValueOperator:
     return built
 
 
+SEEN = [(1.0, 1.0)]
+
+
 def test_means_are_those_of_the_loss_term(operator: ValueOperator) -> None:
     game, found = operator.game, fake_labels(make("narrow_road"), (2.0, 3.0), 5)
     row = residual_table(operator, [found], [])[-1]
@@ -115,7 +118,7 @@ def test_points_lie_in_their_regions(operator: ValueOperator, monkeypatch: pytes
     game, asked = operator.game, list[Points]()
     original = operator.field
 
-    def field(points: Points) -> Field:
+    def field(points: Points, types: Types | None = None) -> Field:
         asked.append(points)
         return original(points)
 
