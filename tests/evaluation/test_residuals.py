@@ -17,7 +17,7 @@ from hno.games import Game, make
 from hno.losses import Scales, View
 from hno.losses.hji import HJIResidual
 from hno.operators import ValueOperator, make_operator
-from hno.types import Field, Points, Sample, Status
+from hno.types import Field, Points, Sample, Status, Types
 from tests.fakes import fake_labels, small_architecture
 from tests.lq import LinearQuadratic
 

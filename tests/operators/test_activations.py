@@ -11,7 +11,7 @@ from hno.operators.deeponet import MLP, DeepONet
 from hno.operators.network import Inputs
 from tests.operators.conftest import ACTIVATIONS
 
-INPUTS = Inputs(ego=5, other=4, others=1, sensors=50)
+INPUTS = Inputs(ego=5, other=4, others=1, role=0, sensors=50)
 PLAIN = {"tanh": torch.tanh, "relu": torch.relu, "sin": lambda z: torch.sin(10 * z)}
 
 

@@ -330,7 +330,7 @@ def test_without_a_compiler_nothing_is_compiled(
 def test_a_net_folds_its_activations_away(activation: str) -> None:
     """Gain, shift and slope go into the weights, and their derivatives come back to the parameters."""
     torch.manual_seed(0)
-    net = DeepONet(Inputs(2, 2, 1, 3), activations.get(activation), width=6, depth=3).double()
+    net = DeepONet(Inputs(2, 2, 1, 0, 3), activations.get(activation), width=6, depth=3).double()
     with torch.no_grad():
         for parameter in net.parameters():
             parameter.mul_(1.1).add_(0.013)
