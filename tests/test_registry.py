@@ -242,8 +242,7 @@ def test_every_group_takes_an_installed_package(tmp_path):
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines() == [
-        f"{kind}|foreign|One of another package.|menagerie 0.3|{group}"
-        for kind, group in GROUPS.items()
+        f"{kind}|foreign|One of another package.|menagerie 0.3|{group}" for kind, group in GROUPS.items()
     ]
 
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import importlib.util
+import inspect
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
@@ -14,17 +15,19 @@ from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.plugins import Plugins
+from hydra.errors import HydraException
 from hydra.plugins.search_path_plugin import SearchPathPlugin
-from omegaconf import DictConfig, OmegaConf, open_dict
-from omegaconf.errors import ConfigAttributeError, ConfigKeyError
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
 import hno
 from hno.cli.arguments import Arguments, UsageError, rewritten
-from hno.cli.kinds import REGISTRIES
+from hno.cli.kinds import GIVEN, REGISTRIES
+from hno.cli.schema import S, SettingsError, validated
 from hno.registry import options_of, plural, unknown_name
 
-CHOSEN = {"game": (), "activation": (), "network": ("inputs", "activation"), "optimizer": ("params", "parameters")}
-"""Groups whose choices are registered, with the arguments of their constructors that are no options."""
+CHOSEN = ("game", "operator", "network", "activation", "optimizer")
+"""Groups whose choices are registered; methods of `operator` are files, its functions become methods."""
 
 
 def config_dir() -> Path:
@@ -59,8 +62,8 @@ class Folders(SearchPathPlugin):
 
 def groups(name: str) -> list[str]:
     """Groups that a root configuration composes."""
-    defaults = OmegaConf.to_container(OmegaConf.load(config_dir() / f"{name}.yaml")).get("defaults", [])
-    return [str(group) for entry in defaults if isinstance(entry, dict) for group in entry]
+    defaults: Any = OmegaConf.select(OmegaConf.load(config_dir() / f"{name}.yaml"), "defaults") or []
+    return [str(group) for entry in defaults if OmegaConf.is_dict(entry) for group in entry]
 
 
 def folders() -> set[str]:
@@ -79,18 +82,42 @@ def choices(group: str) -> dict[str, Path | None]:
 
 def register_plugins() -> None:
     """Make every registered name without a file a choice of its group, with its options and their defaults."""
-    for group, skip in CHOSEN.items():
-        if group not in REGISTRIES:
-            continue
+    for group in CHOSEN:
         registry, have = REGISTRIES[group](), choices(group)
         for name in registry.names():
-            if have.get(name) is None:
-                options = {} if group == "game" else options_of(registry.get(name), skip=skip)
-                node: dict[str, Any] = {"name": name, **options}
-                if group == "game":
-                    node = {"game": {"name": name, "constants": {}}}
-                package = "_global_" if group == "game" else None
+            if have.get(name) is None and (group, name) != ("operator", "gradient"):  # that of our own methods
+                options = options_of(registry.get(name), skip=GIVEN.get(group, ()))
+                node = _NODES.get(group, dict)({"name": name, **_writable(options)})
+                package = "_global_" if group in _NODES else None
                 ConfigStore.instance().store(group=group, name=name, node=node, package=package)
+
+
+def _writable(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Defaults that yaml can hold; an option without a default must be given."""
+    found = {name: "???" if value is inspect.Parameter.empty else value for name, value in options.items()}
+    return {k: list(v) if isinstance(v, tuple) else v for k, v in found.items() if isinstance(v, _PLAIN)}
+
+
+def _game(node: dict[str, Any]) -> dict[str, Any]:
+    """A game with all constants that are numbers."""
+    constants = {key: value for key, value in node.items() if type(value) in (int, float)}
+    return {"game": {"name": node["name"], "constants": constants}}
+
+
+def _method(node: dict[str, Any]) -> dict[str, Any]:
+    """A method whose function is a plugin: the terms are those of `operator=hno`."""
+    content = OmegaConf.to_container(OmegaConf.load(config_dir() / "operator" / "hno.yaml"))
+    assert isinstance(content, dict)
+    return {"operator": {"function": node["name"], **node}, "loss": content["loss"]}
+
+
+_PLAIN = (bool, int, float, str, tuple, list, dict, type(None))
+_NODES: Mapping[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
+    "game": _game,
+    "operator": _method,
+    "optimizer": lambda node: {"optimizer": {"lr": 3e-3, "schedule": "cosine", "final_lr": 3e-5, **node}},
+}
+"""Groups whose nodes are more than a name and options."""
 
 
 def check_choices(name: str, overrides: Sequence[str]) -> None:
@@ -135,9 +162,52 @@ def compose(name: str, overrides: Sequence[str]) -> DictConfig:
     with hydra.initialize_config_dir(str(config_dir()), version_base="1.3"):
         config = hydra.compose(name, overrides=list(overrides), return_hydra_config=True)
     HydraConfig.instance().set_config(config)
-    with open_dict(config):
-        del config["hydra"]
+    OmegaConf.set_struct(config, False)
+    del config["hydra"]
     return config
+
+
+def read(model: type[S], config: DictConfig) -> S:
+    """The composed configuration, judged by the schema of its command.
+
+    Top-level entries that an experiment's file declares for its own interpolations are no part of it.
+
+    Raises:
+        SettingsError: see `hno.cli.schema.validated`.
+    """
+    hydra_config = HydraConfig.get()
+    chosen = hydra_config.runtime.choices.get("experiment")
+    files = [folder / "experiment" / f"{chosen}.yaml" for folder in Folders.all()]
+    helpers = {key for file in files if file.exists() for key in OmegaConf.load(file)} - model.model_fields.keys()
+    given = {override.partition("=")[0].lstrip("+~") for override in hydra_config.overrides.task}
+    content = OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
+    assert isinstance(content, dict)
+    known = {str(key): value for key, value in content.items() if key not in helpers and value != "???"}
+    return validated(model, known, given)
+
+
+def configured(name: str, model: type[S], given: Arguments) -> S | None:
+    """The settings of a command without jobs; None after a dry run, which prints them.
+
+    What a game's file says for other commands is left out.
+
+    Raises:
+        ValueError: a configuration that cannot be composed, or one that the schema refuses.
+    """
+    overrides = for_hydra(name, given)
+    try:
+        config = compose(name, overrides)
+        chosen = [override for override in overrides if override.split("=")[0] in groups(name)]
+        for key, value in compose(name, chosen).items() if chosen else ():
+            if key not in model.model_fields and config[key] == value:
+                del config[key]
+        settings = read(model, config)
+    except (HydraException, OmegaConfBaseException) as error:
+        raise SettingsError(explain(error)) from error
+    if "--dry-run" not in given.flags:
+        return settings
+    print(OmegaConf.to_yaml(OmegaConf.create(settings.model_dump())), end="")
+    return None
 
 
 def quoted(value: str) -> str:
@@ -172,4 +242,3 @@ def heading(path: Path) -> str:
     lines = path.read_text(encoding="utf-8").splitlines()
     head = [line.lstrip("# ") for line in lines if line.startswith("#") and "@package" not in line]
     return re.split(r"(?<=\.) ", " ".join(head))[0].rstrip(".") if lines and lines[0].startswith("#") else ""
-

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,13 +14,15 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
-from hno.cli.build import cache_folder
-from hno.cli.checks import finite_number, flag, whole_number
-from hno.cli.config import run_command
-from hno.cli.logs import send_lightning_to_hydra
+from hno.cli import launch
+from hno.cli.arguments import Arguments
+from hno.cli.checkpoints import trained
+from hno.cli.config import read
+from hno.cli.logs import send_lightning_to_hydra, use_threads
 from hno.cli.results import Results, config_hash, plain, write_json
+from hno.cli.schema import Episodes, EvaluateSettings
 from hno.cli.sections import check_sections, run_sections
-from hno.cli.starts import solve_starts
+from hno.cli.starts import cache_folder, solve_starts
 from hno.cli.summary import report, show
 from hno.control.rollout import Disturbance, control_steps, rollout
 from hno.evaluation.closed_loop import TypeRow, classify, collided, play, tabulate
@@ -34,26 +37,48 @@ from hno.types import Extremal, Trajectory
 log = logging.getLogger(__name__)
 
 
-def main() -> None:
-    """Entry point."""
-    run_command("evaluate", evaluate)
+def run(given: Arguments) -> int:
+    """`hno evaluate`."""
+    return launch.run("evaluate", check, evaluate, given)
 
 
-def evaluate(config: DictConfig) -> bool:
+def check(config: DictConfig) -> EvaluateSettings:
+    """The settings of an evaluation that can be made; nothing is solved or written.
+
+    Raises:
+        ValueError, LookupError: entries that are unknown or make no sense, together or for the game.
+        CheckpointError: a checkpoint that cannot be read.
+    """
+    settings = read(EvaluateSettings, config)
+    with warnings.catch_warnings(action="ignore"):  # the run warns
+        policies, types = load(settings)
+        for policy in policies:
+            check_sections(policy, types, OmegaConf.create(plain(settings)))
+    return settings
+
+
+def load(settings: EvaluateSettings) -> tuple[list[LearnedPolicy], list[tuple[float, ...]]]:
+    """The models to evaluate and the types at which to do so. Raises as `check`."""
+    paths = checkpoints_of(settings)
+    policies = [load_policy(path, settings.expected_game) for path in paths]
+    check_same_game(list(map(str, paths)), [policy.game for policy in policies])
+    check_evaluation(policies[0].game, settings)
+    chosen = [types_to_evaluate(settings.theta, policy, settings.unseen) for policy in policies]
+    return policies, list(dict.fromkeys(theta for own in chosen for theta in own))
+
+
+def evaluate(settings: EvaluateSettings) -> bool:
     """Evaluate checkpoints and write results.json into the run's own folder.
 
     Returns:
         Whether it succeeded. A failure has been logged and is in results.json.
     """
     send_lightning_to_hydra()
-    if OmegaConf.is_missing(config, "checkpoint"):
-        log.error("Say which checkpoint to evaluate: python evaluate.py checkpoint=<path to best.ckpt>")
-        return False
-    folder = Path(HydraConfig.get().runtime.output_dir)
-    head = {"checkpoint": checkpoints_of(config)[0], "config_hash": config_hash(config), "config": plain(config)}
+    folder, paths = Path(HydraConfig.get().runtime.output_dir), list(map(str, checkpoints_of(settings)))
+    head = {"checkpoint": paths[0], "config_hash": config_hash(settings), "config": plain(settings)}
     results = Results(folder / "results.json", head)
     try:
-        _run(config, results)
+        _run(settings, paths, results)
     except Exception as error:
         results.update(status="failed", reason=f"{type(error).__name__}: {error}")
         report(error)
@@ -65,24 +90,18 @@ def evaluate(config: DictConfig) -> bool:
     return True
 
 
-def checkpoints_of(config: DictConfig) -> list[str]:
-    """Paths of the models: one, or several of a list; an empty list names none."""
-    several = OmegaConf.is_list(config.checkpoint) and len(config.checkpoint) > 0
-    return [str(path) for path in config.checkpoint] if several else [str(config.checkpoint)]
+def checkpoints_of(settings: EvaluateSettings) -> list[Path]:
+    """Files of the models: one, or several of a list."""
+    given = settings.checkpoint
+    return [trained(str(path)) for path in (given if isinstance(given, list) else [given])]
 
 
-def _run(config: DictConfig, results: Results) -> None:
-    paths = checkpoints_of(config)
-    policies = [load_policy(path, config.expected_game) for path in paths]
-    game = policies[0].game
+def _run(settings: EvaluateSettings, paths: Sequence[str], results: Results) -> None:
+    use_threads(settings.threads)
+    policies, types = load(settings)
+    game, config = policies[0].game, OmegaConf.create(plain(settings))
     results.update(**policies[0].names(), seed=policies[0].provenance.seed)
-    check_same_game(paths, [policy.game for policy in policies])
-    check_evaluation(game, config)
-    chosen = [types_to_evaluate(config.theta, policy, config.unseen) for policy in policies]
-    types = list(dict.fromkeys(theta for own in chosen for theta in own))
-    for policy in policies:
-        check_sections(policy, types, config)
-    labels = solve_tests(game, types, config, cache_folder(config.cache), config.workers, results)
+    labels = solve_tests(game, types, config, cache_folder(settings.cache), settings.workers, results)
     models, outcomes = list[dict[str, Any]](), list[Sequence[Tensor]]()
     for path, policy in zip(paths, policies, strict=True):
         log.info("evaluation of %s", path)
@@ -99,22 +118,26 @@ def _run(config: DictConfig, results: Results) -> None:
     results.update(status="finished")
 
 
-def types_to_evaluate(
-    text: str, policy: LearnedPolicy, unseen: Sequence[Sequence[float]] = ()
-) -> list[tuple[float, ...]]:
-    """Player types from "default", a named grid, or a list such as "1,1;2.5,4".
+def types_to_evaluate(choice: Any, policy: LearnedPolicy, unseen: Any = ()) -> list[tuple[float, ...]]:
+    """Player types to evaluate a policy at.
 
     Default are the labelled types, and those of `unseen` that lie in the game's type box.
+
+    Args:
+        choice: "default", or what `parse_types` takes.
+        policy: the policy.
+        unseen: types that are added to the labelled ones.
 
     Raises:
         ValueError: none of these, or entries that are not one finite number per player.
     """
     game = policy.game
-    if text == "default":
-        own = [theta for theta in unseen if len(theta) == game.players]
-        inside = [theta for theta in own if bool(game.type_box.contains(torch.tensor(theta)))]
-        return list(dict.fromkeys([*policy.types, *game.validate_types(inside)]))
-    return parse_types(game, text, also=("default",))
+    if choice != "default":
+        return parse_types(game, choice, key="theta", also=("default",))
+    fitting = [theta for theta in unseen if len(theta) == game.players] if isinstance(unseen, list) else unseen
+    found = parse_types(game, fitting, key="unseen") if fitting else []
+    inside = [theta for theta in found if bool(game.type_box.contains(torch.tensor(theta)))]
+    return list(dict.fromkeys([*policy.types, *inside]))
 
 
 def solve_tests(
@@ -190,15 +213,6 @@ def draw(policy: LearnedPolicy, found: Extremal, path: Path, dt: float, episodes
         log.info("No picture: %s", error)
 
 
-def check_evaluation(game: Game, settings: DictConfig) -> None:
+def check_evaluation(game: Game, settings: Episodes) -> None:
     """Raise ValueError for entries that make no evaluation of the game."""
-    for name, least in (("starts", 1), ("seed", 0), ("delay", 0)):
-        whole_number(name, settings[name], least)
-    if settings.get("workers") is not None:
-        whole_number("workers", settings.workers, 1)
-    for name in ("clearance", "dt", "noise", "widen"):
-        finite_number(name, settings[name])
-    if settings.widen == 0:
-        raise ValueError("widen must be a positive number; got 0.")
-    flag("safe", settings.safe)
     control_steps(game, settings.dt)

@@ -37,8 +37,7 @@ def configuration_help(name: str, given: Arguments) -> str:
             prefix = "" if "@package _global_" in text else f"{group}."
             said.update({prefix + key: comment for key, comment in comments(text)})
     head = "Groups, group=choice (*: chosen)\n" + "\n".join(parts) + "\n\n" if parts else ""
-    content = OmegaConf.to_container(config, resolve=False)
-    assert isinstance(content, dict)
+    content: Any = OmegaConf.to_container(config, resolve=False)
     return head + "Keys, key=value\n" + "\n".join(_keys(content, said))
 
 

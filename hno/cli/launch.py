@@ -9,7 +9,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
@@ -21,17 +21,19 @@ from hno.cli import pages
 from hno.cli.arguments import Arguments
 from hno.cli.config import compose, config_dir, explain, for_hydra, quoted, register_plugins
 from hno.cli.results import Results
-from hno.cli.sweep import Job, show_jobs
+from hno.cli.sweep import Job, counted, show_jobs
+from hno.training.checkpoint import CheckpointError
 
 log = logging.getLogger(__name__)
 
-Check = Callable[[DictConfig], object]
-"""Raises ValueError or LookupError for a configuration that makes no run."""
+S = TypeVar("S")
+REFUSALS = (HydraException, OmegaConfBaseException, CheckpointError, ValueError, LookupError)
+"""What a configuration raises that makes no run."""
 NAMED = ("game", "operator", "activation")
 """Groups that name a job in results.json."""
 
 
-def run(name: str, check: Check, task: Callable[[DictConfig], bool], given: Arguments) -> int:
+def run(name: str, check: Callable[[DictConfig], S], task: Callable[[S], bool], given: Arguments) -> int:
     """Check configurations and run a task on each, in every job of a multirun.
 
     A multirun ends with a table of its jobs, also when it is interrupted. The last line is the path of the page, which
@@ -39,7 +41,7 @@ def run(name: str, check: Check, task: Callable[[DictConfig], bool], given: Argu
 
     Args:
         name: the root configuration.
-        check: judges a composed configuration before its work.
+        check: judges a composed configuration before its work and returns its settings.
         task: does one job; false if it failed (it has said why).
         given: the command line.
 
@@ -64,13 +66,8 @@ def run(name: str, check: Check, task: Callable[[DictConfig], bool], given: Argu
         return _run_jobs(name, check, task, [*given.hydra, *overrides])
     except OSError as error:
         return _refuse(f"The output folder cannot be written ({error}). Choose another with --to <folder>.")
-    except (HydraException, OmegaConfBaseException, ValueError, LookupError) as error:
+    except REFUSALS as error:
         return _refuse(explain(error))
-
-
-def into(folder: str) -> list[str]:
-    """The overrides that `--to` stands for."""
-    return [f"hydra.run.dir={quoted(folder)}", f"hydra.sweep.dir={quoted(folder)}"]
 
 
 def _refuse(message: str) -> int:
@@ -78,7 +75,7 @@ def _refuse(message: str) -> int:
     return 1
 
 
-def _run_jobs(name: str, check: Check, task: Callable[[DictConfig], bool], words: Sequence[str]) -> int:
+def _run_jobs(name: str, check: Callable[[DictConfig], S], task: Callable[[S], bool], words: Sequence[str]) -> int:
     outcomes: list[bool] = []
     jobs: list[Job] = []
     folders: list[Path] = []
@@ -87,12 +84,12 @@ def _run_jobs(name: str, check: Check, task: Callable[[DictConfig], bool], words
         current = Job.current()
         jobs.extend([] if current is None else [current])
         try:
-            check(config)
-        except (OmegaConfBaseException, ValueError, LookupError) as error:
+            settings = check(config)
+        except REFUSALS as error:
             outcomes.append(_refused(explain(error)))
             return
         folders.append(Path(HydraConfig.get().runtime.output_dir))
-        outcomes.append(task(config))
+        outcomes.append(task(settings))
 
     try:
         _hydra(name, job, words)
@@ -114,7 +111,7 @@ def _refused(reason: str) -> bool:
     return False
 
 
-def _dry_jobs(name: str, check: Check, overrides: Sequence[str]) -> int:
+def _dry_jobs(name: str, check: Callable[[DictConfig], object], overrides: Sequence[str]) -> int:
     """Print the jobs of a multirun, and why some would be refused."""
     outcomes: list[bool] = []
 
@@ -124,16 +121,16 @@ def _dry_jobs(name: str, check: Check, overrides: Sequence[str]) -> int:
         reason = ""
         try:
             check(config)
-        except (OmegaConfBaseException, ValueError, LookupError) as error:
+        except REFUSALS as error:
             reason = f"\n   refused: {explain(error)}"
         outcomes.append(not reason)
         print(f"{found.number}: {' '.join(found.settings)}{reason}")
 
     quiet = ["hydra/hydra_logging=disabled", "hydra/job_logging=disabled", "hydra.output_subdir=null"]
     with tempfile.TemporaryDirectory() as folder:
-        _hydra(name, job, ["--multirun", *overrides, *quiet, *into(folder)])
+        _hydra(name, job, ["--multirun", *overrides, *quiet, f"hydra.sweep.dir={quoted(folder)}"])
     refused = outcomes.count(False)
-    print(f"{pages.count(len(outcomes), 'job')}" + (f", {refused} refused" if refused else ""))
+    print(counted(len(outcomes)) + (f", {refused} refused" if refused else ""))
     return 1 if refused else 0
 
 

@@ -25,6 +25,8 @@ class Command(NamedTuple):
     """Its root configuration, if it has one."""
     word: str | None = None
     """What a word without a flag or = sets."""
+    to: tuple[str, ...] = ()
+    """Keys that --to sets."""
     flags: tuple[str, ...] = ()
     """Flags besides --help and --version."""
 
@@ -33,6 +35,7 @@ JOBS = (
     "--dry-run", "--to", "--multirun", "--config-dir", "--cfg", "--package", "--info", "--resolve", "--hydra-help",
     "--shell-completion",
 )  # fmt: skip
+FOLDERS = ("hydra.run.dir", "hydra.sweep.dir")
 FLAGS = {
     "--dry-run": "print the configuration (with -m: the jobs) after it has been checked, and end",
     "--to": "PATH: where results go",
@@ -45,22 +48,22 @@ COMMANDS = {
     "train": Command(
         "hno.cli.train:run", "[group=choice ...] [key=value ...] [-m]",
         "Solve labels, train an operator and evaluate it. The run's folder gets checkpoints, metrics and results.json.",
-        "train", flags=JOBS,
+        "train", to=FOLDERS, flags=JOBS,
     ),
     "evaluate": Command(
         "hno.cli.evaluate:run", "checkpoint=FILE [key=value ...] [-m]",
         "Evaluate checkpoints. How often they collide, where they err, and how they compare on the same starts.",
-        "evaluate", "checkpoint", JOBS,
+        "evaluate", "checkpoint", FOLDERS, JOBS,
     ),
     "labels": Command(
         "hno.cli.labels:run", "game=NAME theta=TYPES n=STARTS [key=value ...]",
-        "Solve open-loop equilibria and keep them with their certificates. A run that was stopped goes on where it was.",
-        "labels", flags=("--dry-run", "--to", "--config-dir"),
+        "Solve open-loop equilibria and keep them with their certificates. What was stopped goes on where it was.",
+        "labels", to=("cache",), flags=("--dry-run", "--to", "--config-dir"),
     ),
     "report": Command(
         "hno.cli.pages:run", "FOLDER [key=value ...]",
         "Write a page about a run or a sweep, or figures for documents.",
-        "report", "folder", ("--dry-run", "--to"),
+        "report", "folder", ("to",), ("--dry-run", "--to"),
     ),
     "list": Command(
         "hno.cli.listing:run", "[KIND ...]",
@@ -112,18 +115,20 @@ def _run(command: Command, given: Arguments, prog: str) -> int:
     if "--help" in given.flags:
         print(_help(command, given, prog))
         return 0
-    return int(pkgutil.resolve_name(command.run)(_with_word(command, given, prog)))
+    return int(pkgutil.resolve_name(command.run)(_configured(command, given, prog)))
 
 
-def _with_word(command: Command, given: Arguments, prog: str) -> Arguments:
-    """A bare word as the override that it stands for, where the command has a configuration."""
-    if command.config is None or not given.words:
+def _configured(command: Command, given: Arguments, prog: str) -> Arguments:
+    """A bare word and --to as the overrides that they stand for, where the command has a configuration."""
+    if command.config is None:
         return given
-    if command.word is None or len(given.words) > 1:
-        raise UsageError(f"{prog}: what is {given.words[-1]!r}? Usage: {prog} {command.usage}")
     from hno.cli.config import quoted
 
-    return Arguments([], [*given.overrides, f"{command.word}={quoted(given.words[0])}"], given.flags)
+    if len(given.words) > (command.word is not None):
+        raise UsageError(f"{prog}: what is {given.words[-1]!r}? Usage: {prog} {command.usage}")
+    stands_for = [f"{command.word}={quoted(word)}" for word in given.words]
+    stands_for += [f"{key}={quoted(given.flags['--to'])}" for key in command.to if "--to" in given.flags]
+    return given._replace(words=[], overrides=[*given.overrides, *stands_for])
 
 
 def _overview() -> str:

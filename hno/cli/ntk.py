@@ -8,7 +8,7 @@ from typing import Any
 from omegaconf import DictConfig
 from rich.table import Table
 
-from hno.cli.checks import whole_number
+from hno.cli.schema import EvaluationSettings
 from hno.data.rows import NoLabelsError
 from hno.evaluation.ntk import rows_per_point, type_kernel
 from hno.evaluation.spectrum import Summary, summary
@@ -29,12 +29,13 @@ def check_ntk(policy: LearnedPolicy, types: Iterable[tuple[float, ...]], setting
         raise ValueError(f'ntk=true needs a type of the training run among theta; these are "{seen}".')
 
 
-def check_rows(operator: ValueOperator, settings: DictConfig) -> None:
+def check_rows(operator: ValueOperator, settings: DictConfig | EvaluationSettings) -> None:
     """Raise ValueError unless the operator is one net and its kernel has rows for at least one point."""
     members = len(operator.members)
     if members > 1:
         raise ValueError(f"ntk=true is for one net, this operator has {members}. Train it with operator.members=1.")
-    whole_number("ntk_rows", settings.ntk_rows, rows_per_point(operator), "the rows of one point")
+    if settings.ntk_rows < (least := rows_per_point(operator)):
+        raise ValueError(f"ntk_rows must be at least {least}, the rows of one point; got {settings.ntk_rows}.")
 
 
 def ntk_section(policy: LearnedPolicy, labels: Sequence[Extremal], settings: DictConfig) -> list[dict[str, Any]]:

@@ -10,7 +10,6 @@ from omegaconf import DictConfig
 from rich.console import Console
 from rich.table import Table
 
-from hno.cli.checks import whole_number
 from hno.cli.tables import types
 from hno.control.receding_horizon import RecedingHorizon
 from hno.control.rollout import Disturbance
@@ -49,12 +48,6 @@ def online_section(policy: LearnedPolicy, labels: Sequence[Extremal], settings: 
 
 def _plain(value: Any) -> Any:
     return value._asdict() if hasattr(value, "_asdict") else value
-
-
-def check_online(settings: DictConfig) -> None:
-    """Raise ValueError for numbers of starts or steps that are none."""
-    for name, least in (("online", 0), ("online_interval", 1)):
-        whole_number(name, settings[name], least)
 
 
 def show_online(section: Mapping[str, Any], console: Console) -> None:

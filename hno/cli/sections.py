@@ -9,12 +9,10 @@ from typing import Any, NamedTuple
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
-from hno.cli.build import cache_folder
-from hno.cli.checks import flag
 from hno.cli.ntk import check_ntk, ntk_section, ntk_table
-from hno.cli.online import check_online, online_section, show_online
+from hno.cli.online import online_section, show_online
 from hno.cli.results import Results
-from hno.cli.starts import solve_starts
+from hno.cli.starts import cache_folder, solve_starts
 from hno.cli.tables import show_residuals, show_robustness
 from hno.control.rollout import Disturbance
 from hno.evaluation.residuals import residual_table
@@ -77,9 +75,6 @@ SECTIONS: dict[str, Section] = {
 
 def check_sections(policy: LearnedPolicy, types: Types, settings: DictConfig) -> None:
     """Raise ValueError for entries that make no sections."""
-    for name in ("residuals", "robustness", "ntk"):
-        flag(name, settings[name])
-    check_online(settings)
     for name, section in SECTIONS.items():
         if settings[name]:
             section.check(policy, types, settings)

@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 import pytest
 import torch
+from hno.data.generate import main
 from torch import Tensor
 
 from hno.data import labels as label_data
-from hno.data.generate import main
 from hno.data.labels import Request, label_set
 from hno.data.shards import SHARD
 from hno.games import Game, make

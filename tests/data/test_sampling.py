@@ -4,11 +4,11 @@ import math
 
 import pytest
 import torch
+from hno.data.sampling import SOURCES, check_shares, onto_band
 from torch import Tensor
 
 from hno.data.curriculum import Curriculum
 from hno.data.datamodule import BOX_TYPES
-from hno.data.sampling import SOURCES, check_shares, onto_band
 from hno.games import Game, make
 from hno.types import Trajectory
 from tests.data.conftest import TYPES, MakeData
