@@ -68,7 +68,7 @@ def parse(given: Sequence[str]) -> Arguments:
     return found
 
 
-def rewritten(override: str, groups: Collection[str], folders: Collection[str]) -> str:
+def rewritten(override: str, groups: Collection[str], untouched: Collection[str]) -> str:
     """An override as Hydra is to see it: any key may be set, since the schema judges the result.
 
     A list of player types is quoted; `a.b=c` and `+a.b=c` become `++a.b=c`, `+group=choice` becomes `group=choice`.
@@ -76,7 +76,7 @@ def rewritten(override: str, groups: Collection[str], folders: Collection[str]) 
     Args:
         override: as given.
         groups: those that the command composes.
-        folders: every folder of choices there is; one that the command does not compose is left as given.
+        untouched: further keys, which stay as given.
     """
     key, equals, value = override.partition("=")
     bare = key.lstrip("+").split("@")[0]
@@ -84,7 +84,7 @@ def rewritten(override: str, groups: Collection[str], folders: Collection[str]) 
         return override
     if bare in groups:
         return f"{key.lstrip('+')}{equals}{value}"
-    if bare in folders:
+    if bare in untouched:
         return override
     types = TYPES.fullmatch(override)
     return f"++{key.lstrip('+')}={repr(types[2]) if types else value}"

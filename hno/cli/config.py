@@ -153,8 +153,16 @@ def for_hydra(name: str, given: Arguments) -> list[str]:
     Folders.own = [] if folder is None else [Path(folder)]
     Plugins.instance().register(Folders)
     check_choices(name, given.overrides)
-    composed, known = groups(name), folders()
-    return [rewritten(override, composed, known) for override in given.overrides]
+    composed, untouched = groups(name), folders()
+    if "--multirun" in given.flags:
+        untouched |= _swept(name, [override for override in given.overrides if override.startswith("experiment=")])
+    return [rewritten(override, composed, untouched) for override in given.overrides]
+
+
+def _swept(name: str, experiment: Sequence[str]) -> set[str]:
+    """Keys that an experiment sweeps over: Hydra lets the command line narrow them under the same name only."""
+    compose(name, experiment)
+    return set(HydraConfig.get().sweeper.params or ())
 
 
 def compose(name: str, overrides: Sequence[str]) -> DictConfig:

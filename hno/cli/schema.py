@@ -45,8 +45,13 @@ def _one_of(*known: str) -> PlainValidator:
     return _must(f"one of {', '.join(known)}", lambda value: value in known)
 
 
-def _is_types(value: object) -> bool:
-    return value is None or (isinstance(value, (str, list)) and value != "")
+def _types(value: Any) -> Any:
+    """Player types as `hno.games.grid.parse_types` takes them."""
+    if type(value) in (int, float):
+        return str(value)
+    if not (value is None or (isinstance(value, (str, list)) and value != "")):
+        raise ValueError(f" must name player types, or list them as 1,1;2.5,4 or [[1, 1], [2.5, 4]]; got {value!r}.")
+    return value
 
 
 Flag = Annotated[bool, _must("true or false", lambda value: isinstance(value, bool))]
@@ -58,10 +63,7 @@ Seed = Annotated[int, _whole(0, LARGEST_SEED, f"a whole number from 0 to {LARGES
 Positive = Annotated[float, _must("a positive number", lambda value: _number(value) and value > 0)]
 Amount = Annotated[float, _must("a finite number of at least 0", lambda value: _number(value) and value >= 0)]
 Share = Annotated[float, _must("a share of the run, from 0 to 1", lambda value: _number(value) and 0 <= value <= 1)]
-Rate = Annotated[float, _must("a positive number", lambda value: type(value) in (int, float) and value > 0)]
-Types = Annotated[
-    Any, _must("player types: a name, text such as '1,1;2.5,4' or a list such as [[1, 1], [5, 5]]", _is_types)
-]
+Types = Annotated[Any, PlainValidator(_types)]
 Paths = Annotated[
     Any, _must("a checkpoint, the folder of a run, or a list of them", lambda v: bool(v) and isinstance(v, (str, list)))
 ]
@@ -99,16 +101,25 @@ _LIKE: Mapping[type, tuple[str, Callable[[Any], bool]]] = {
 """What an option must be, by the type of its default."""
 
 
-def _part(kind: str, own: Collection[str] = ()) -> PlainValidator:
-    """A registered name with its options; `own` belong to the package and are checked elsewhere."""
+def _part(kind: str) -> PlainValidator:
+    """A registered name with its options."""
 
     def check(content: Any) -> dict[str, Any]:
         found = _mapping(content, ("name",))
-        options = {key: value for key, value in found.items() if key not in ("name", *own)}
-        _checked(kind, found["name"], options)
+        _checked(kind, found["name"], {key: value for key, value in found.items() if key != "name"})
         return found
 
     return PlainValidator(check)
+
+
+def _optimizer(content: Any) -> dict[str, Any]:
+    """A registered optimiser with its options, and the schedule of its learning rate."""
+    found = _mapping(content, ("name", *SCHEDULE))
+    for key in ("lr", "final_lr"):
+        if not (type(found[key]) in (int, float) and found[key] > 0):
+            raise ValueError(f".{key} must be a positive number; got {found[key]!r}.")
+    _checked("optimizer", found["name"], {key: value for key, value in found.items() if key not in ("name", *SCHEDULE)})
+    return found
 
 
 def _mapping(content: Any, needed: Collection[str] = ()) -> dict[str, Any]:
@@ -134,6 +145,7 @@ def _operator(content: Any, info: ValidationInfo) -> dict[str, Any]:
 
 
 SHARED = ("exact_terminal", "members")
+SCHEDULE = ("lr", "schedule", "final_lr")
 
 
 def _terms(content: Any) -> dict[str, dict[str, Any]]:
@@ -282,7 +294,7 @@ class TrainSettings(Settings):
     data: DataSettings
     sampler: Annotated[dict[str, dict[str, Any]], PlainValidator(_sampler)]
     loss: LossSettings
-    optimizer: Annotated[dict[str, Any], _part("optimizer", ("lr", "schedule", "final_lr"))]
+    optimizer: Annotated[dict[str, Any], PlainValidator(_optimizer)]
     trainer: TrainerSettings
     logger: LoggerSettings
     evaluation: EvaluationSettings
@@ -356,7 +368,7 @@ def _sentence(model: type[Settings], found: Any) -> str:
     if found["type"] == "extra_forbidden":
         return f"{key} does not exist. {unknown_name('configuration key', names[-1], _known(model, names[:-1]))}"
     if found["type"] == "missing":
-        return f"{key} is missing."
+        return f"{key} is missing: give it as {key}=<value>; --help says more."
     if "error" in found.get("ctx", {}):
         return key + str(found["ctx"]["error"])
     return f"{key}: {found['msg']}; got {found['input']!r}."
