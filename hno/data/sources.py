@@ -214,7 +214,7 @@ def onto_band(game: Game, x: Tensor, theta: Tensor, target: Tensor, iterations: 
     for _ in range(iterations):
         with torch.enable_grad():
             x = x.detach().requires_grad_()
-            worst = game.constraint(x, theta).flatten(1).amax(-1)
+            worst = game.constraint(x, theta).amax((-2, -1))
             slope = torch.autograd.grad(worst.sum(), x)[0] * width
         size = slope.square().sum((-2, -1)).clamp_min(1e-12)
         step = ((target - worst.detach()) / size)[:, None, None] * slope * width

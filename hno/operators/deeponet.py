@@ -73,9 +73,10 @@ class DeepONet(Network):
         super().__init__()
         self.inputs = inputs
         hidden, several = (width,) * (depth + 1), inputs.others > 1
-        self.trunk = MLP((inputs.ego + width if several else inputs.total, *hidden), activation())
+        ego = inputs.ego + inputs.role
+        self.trunk = MLP((ego + width if several else inputs.total, *hidden), activation())
         self.branch = MLP((inputs.sensors, *hidden), activation())
-        self.pair = MLP((inputs.ego + inputs.other, width, width), activation()) if several else None
+        self.pair = MLP((ego + inputs.other, width, width), activation()) if several else None
         self.kernels: Kernels | None = None
 
     def forward(self, y: Tensor, sensors: Tensor, which: Tensor) -> Tensor:
@@ -102,6 +103,9 @@ class DeepONet(Network):
         """What the trunk sees, (R, trunk inputs)."""
         if self.pair is None:
             return y
-        ego, others = y[:, : self.inputs.ego], y[:, self.inputs.ego :].unflatten(1, (self.inputs.others, -1))
-        pairs = torch.cat([ego.unsqueeze(1).expand(-1, self.inputs.others, -1), others], -1)
+        sizes = self.inputs
+        own, others, role = y.split([sizes.ego, sizes.others * sizes.other, sizes.role], -1)
+        ego = torch.cat([own, role], -1)
+        blocks = others.unflatten(-1, (sizes.others, sizes.other))
+        pairs = torch.cat([ego.unsqueeze(1).expand(-1, sizes.others, -1), blocks], -1)
         return torch.cat([ego, self.pair(pairs).mean(1)], -1)

@@ -28,11 +28,11 @@ class Encoding(nn.Module):
         self.game = [game]  # a list: the operator owns the game, whose buffers must not be saved twice
         self.register_buffer("roles", torch.tensor(game.roles, dtype=game.state_box.lo.dtype), persistent=False)
         self.has_roles, self.several = len(set(game.roles)) > 1, game.players > 2
-        self.periodic = list(getattr(game, "periodic", ()))
+        self.periodic = list(game.periodic)
         self.features = game.state_dim + len(self.periodic)
         sensors = game.sensors((game.type_box.lo + game.type_box.hi) / 2).shape[-1]
         other = self.features + self.several * (self.has_roles + 1)
-        self.sizes = Inputs(1 + self.features + self.has_roles, other, game.players - 1, sensors)
+        self.sizes = Inputs(1 + self.features, other, game.players - 1, int(self.has_roles), sensors)
 
     def forward(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
         """Trunk inputs, (B,), (B, P, n), (B, P) -> (B, P, `Inputs.total`)."""
@@ -42,7 +42,7 @@ class Encoding(nn.Module):
         parts = [states, *([roles] if self.has_roles else []), game.type_box.scale(theta).to(x).unsqueeze(-1)]
         others = ego_views(torch.cat(parts, -1) if self.several else states)[..., 1:, :].flatten(-2)
         times = (2 * tau / game.horizon - 1)[..., None, None].expand(*states.shape[:-1], 1)
-        return torch.cat([times, states, *([roles] if self.has_roles else []), others], -1)
+        return torch.cat([times, states, others, *([roles] if self.has_roles else [])], -1)
 
     def _features(self, x: Tensor) -> Tensor:
         """Scaled states; those that wrap around as sine and cosine, (B, P, n) -> (B, P, features)."""
@@ -61,8 +61,8 @@ class Encoding(nn.Module):
     def state_slope(self, gradient: Tensor, x: Tensor) -> Tensor:
         """Gradient in y (B, P, `Inputs.total`) -> derivative of every player in every state, (B, P, P, n)."""
         (game,) = self.game
-        own = gradient[..., None, 1 : 1 + self.features]
-        others = gradient[..., self.sizes.ego :].unflatten(-1, (self.sizes.others, self.sizes.other))
+        sizes, own = self.sizes, gradient[..., None, 1 : 1 + self.features]
+        others = gradient[..., sizes.ego : sizes.total - sizes.role].unflatten(-1, (sizes.others, sizes.other))
         views = torch.cat([own, others[..., : self.features]], -2)
         slope = ego_views(views, inverse=True)
         scaled = slope[..., : game.state_dim]

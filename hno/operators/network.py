@@ -16,23 +16,26 @@ networks: Registry[Network] = Registry("network", "hno.operators")
 class Inputs(NamedTuple):
     """Sizes of what a network is fed with.
 
-    A row of y holds what a player sees of itself, then a block of equal layout for every other player. Players who are
-    interchangeable have interchangeable blocks: a network for more than two players must not depend on their order.
+    A row of y holds what a player sees of itself, a block of equal layout for every other player, and its role where
+    roles differ. Players who are interchangeable have interchangeable blocks: a network for more than two players must
+    not depend on their order.
     """
 
     ego: int
-    """Scaled time to go, the player's own scaled state, and its role where roles differ."""
+    """Scaled time to go and the player's own scaled state."""
     other: int
     """The scaled state of another player and, where there are several, its role and its scaled type."""
     others: int
     """Number of other players, P - 1."""
+    role: int
+    """1 where roles differ, otherwise 0."""
     sensors: int
     """Branch input."""
 
     @property
     def total(self) -> int:
         """Size of y."""
-        return self.ego + self.others * self.other
+        return self.ego + self.others * self.other + self.role
 
 
 class Network(nn.Module, abc.ABC):

@@ -44,7 +44,7 @@ def test_collision_radius_of_a_row_is_that_of_its_own_theta(
     game = make(name)
     points = make_data(game, interior_types=types).batch(9)[stream].points
     assert len(points.theta.unique(dim=0)) > 2
-    own = game.constraint(points.x, points.theta) + distance(name, points.x).unsqueeze(-1)
+    own = game.constraint(points.x, points.theta)[..., 0] + distance(name, points.x).unsqueeze(-1)
     torch.testing.assert_close(own, radius(name, points.theta).unsqueeze(-1).expand(-1, 2), rtol=0, atol=2e-4)
 
 
@@ -76,7 +76,7 @@ def test_band_is_that_of_the_theta_of_each_row(make_data: MakeData, name: str) -
 def test_band_spreads_over_its_width(make_data: MakeData) -> None:
     game, sizes = make("narrow_road"), {"bvp": 1, "interior": 2000, "terminal": 1}
     points = make_data(game, shares=ONLY["band"], batch_sizes=sizes).batch(9)["interior"].points
-    gap = game.constraint(points.x, points.theta).amax(-1)
+    gap = game.constraint(points.x, points.theta).amax((-2, -1))
     assert float((gap < -1).float().mean()) > 0.1
     assert float((gap > 0).float().mean()) > 0.05
 
@@ -85,7 +85,7 @@ def test_onto_band_reaches_its_target() -> None:
     game, generator = make("lane_change"), torch.Generator().manual_seed(0)
     x, theta = game.state_box.sample(500, generator), game.type_box.sample(500, generator)
     target = torch.linspace(-1.5, 0.3, 500)
-    gap = game.constraint(onto_band(game, x, theta, target), theta).amax(-1) - target
+    gap = game.constraint(onto_band(game, x, theta, target), theta).amax((-2, -1)) - target
     assert float(gap.abs().median()) < 1e-3
 
 

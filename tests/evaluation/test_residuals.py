@@ -127,7 +127,7 @@ def test_points_lie_in_their_regions(operator: ValueOperator, monkeypatch: pytes
     assert bool(game.initial_box.contains(start.x).all())
     assert bool((start.tau == game.horizon).all())
     assert bool(game.state_box.contains(box.x).all())
-    near = [float((game.constraint(p.x, p.theta).amax(-1).abs() < 1.6).float().mean()) for p in (box, band)]
+    near = [float((game.constraint(p.x, p.theta).amax((-2, -1)).abs() < 1.6).float().mean()) for p in (box, band)]
     assert near[1] > 0.5 > 5 * near[0]
     closest = (around.x[:200].flatten(1).unsqueeze(1) - along.x.flatten(1)).abs() / game.state_box.width.flatten()
     assert float(closest.square().mean(-1).sqrt().amin(-1).median()) < 0.07

@@ -110,7 +110,7 @@ def test_at_rest_the_residual_is_the_penalty_at_the_rows_own_types(name):
     at = points(game)
     still = torch.zeros(32, 2, dtype=torch.float64)
     costate = torch.zeros(32, 2, *at.x.shape[1:], dtype=torch.float64)
-    penalty = game.penalty(game.constraint(at.x, at.theta))
+    penalty = game.penalty(at.x, at.theta)
     torch.testing.assert_close(hji_residual(game, at, Field(still, still, costate)), penalty, rtol=1e-9, atol=1e-9)
 
 

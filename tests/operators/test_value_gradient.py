@@ -366,7 +366,7 @@ def plain_loss(operator: ValueOperator, batch: Batch, weights: Mapping[str, floa
     labelled = plain_field(operator, batch["bvp"].points)
     inside, end = batch["interior"].points, batch["terminal"].points
     residual = hji_residual(game, inside, plain_field(operator, inside))
-    size = scale / game.horizon + game.penalty(game.constraint(inside.x, inside.theta))
+    size = scale / game.horizon + game.penalty(inside.x, inside.theta)
     terms = {
         "value": (labelled.value - labels.value) / scale,
         "costate": (labelled.costate - labels.costate) / operator.costate_scale,

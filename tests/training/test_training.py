@@ -411,7 +411,7 @@ def test_means_run_only_where_they_are_asked_for(make_operator: MakeOperator) ->
 def residuals(operator: ValueOperator, batch: Batch) -> Tensor:
     """Residual of every player at every collocation point, in the unit of the loss, (B, P)."""
     points, game = batch["interior"].points, operator.game
-    size = operator.value_scale / game.horizon + game.penalty(game.constraint(points.x, points.theta))
+    size = operator.value_scale / game.horizon + game.penalty(points.x, points.theta)
     with torch.no_grad():
         found = hji_residual(game, points, operator.field(points))
     return found / size if operator.scaled else found
