@@ -10,7 +10,7 @@ from omegaconf import DictConfig
 
 from hno.cli.checkpoints import resumed
 from hno.cli.config import read
-from hno.cli.evaluate import check_evaluation
+from hno.cli.evaluate import check_evaluation, unseen_types
 from hno.cli.ntk import check_rows
 from hno.cli.results import plain
 from hno.cli.schema import GameSettings, TrainSettings
@@ -36,7 +36,7 @@ def check(config: DictConfig) -> TrainSettings:
     with warnings.catch_warnings(action="ignore"):  # the run warns
         game = build_game(settings.game)
         check_evaluation(game, settings.evaluation)
-        parse_types(game, settings.evaluation.types, key="evaluation.types")
+        unseen_types(game, settings.evaluation.types, "evaluation.types")
         if settings.validation.types is not None:
             parse_types(game, settings.validation.types, key="validation.types")
         operator, objective = make_operator(game, build_architecture(settings)), build_objective(settings)

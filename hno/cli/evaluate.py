@@ -118,26 +118,41 @@ def _run(settings: EvaluateSettings, paths: Sequence[str], results: Results) -> 
     results.update(status="finished")
 
 
-def types_to_evaluate(choice: Any, policy: LearnedPolicy, unseen: Any = ()) -> list[tuple[float, ...]]:
+def types_to_evaluate(choice: Any, policy: LearnedPolicy, unseen: Any = None) -> list[tuple[float, ...]]:
     """Player types to evaluate a policy at.
 
-    Default are the labelled types, and those of `unseen` that lie in the game's type box.
+    Default are the labelled types and those that `unseen` adds.
 
     Args:
         choice: "default", or what `parse_types` takes.
         policy: the policy.
-        unseen: types that are added to the labelled ones.
+        unseen: see `unseen_types`.
 
     Raises:
         ValueError: none of these, or entries that are not one finite number per player.
     """
-    game = policy.game
     if choice != "default":
-        return parse_types(game, choice, key="theta", also=("default",))
-    fitting = [theta for theta in unseen if len(theta) == game.players] if isinstance(unseen, list) else unseen
-    found = parse_types(game, fitting, key="unseen") if fitting else []
-    inside = [theta for theta in found if bool(game.type_box.contains(torch.tensor(theta)))]
-    return list(dict.fromkeys([*policy.types, *inside]))
+        return parse_types(policy.game, choice, key="theta", also=("default",))
+    return list(dict.fromkeys([*policy.types, *unseen_types(policy.game, unseen, "unseen")]))
+
+
+def unseen_types(game: Game, choice: Any, key: str) -> list[tuple[float, ...]]:
+    """Types that are evaluated beside the labelled ones: the chosen ones, or four at quarters of the type box.
+
+    Args:
+        game: the game.
+        choice: what `parse_types` takes; None for the four.
+        key: where the choice stands, for messages.
+    """
+    if choice is not None:
+        return parse_types(game, choice, key=key) if choice else []
+    lo, width = game.type_box.lo, game.type_box.hi - game.type_box.lo
+    quarters = [[own, *[others] * (game.players - 1)] for own, others in QUARTERS]
+    return game.validate_types([(lo + width * torch.tensor(row) / 4).tolist() for row in quarters])
+
+
+QUARTERS = ((0, 1), (1, 1), (1, 3), (3, 4))
+"""Places in the type box, of the first player and of the others, in quarters of its edges."""
 
 
 def solve_tests(

@@ -9,7 +9,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
@@ -21,12 +21,12 @@ from hno.cli import pages
 from hno.cli.arguments import Arguments
 from hno.cli.config import compose, config_dir, explain, for_hydra, quoted, register_plugins
 from hno.cli.results import Results
+from hno.cli.schema import S, Settings
 from hno.cli.sweep import Job, counted, show_jobs
 from hno.training.checkpoint import CheckpointError
 
 log = logging.getLogger(__name__)
 
-S = TypeVar("S")
 REFUSALS = (HydraException, OmegaConfBaseException, CheckpointError, ValueError, LookupError)
 """What a configuration raises that makes no run."""
 NAMED = ("game", "operator", "activation")
@@ -57,9 +57,9 @@ def run(name: str, check: Callable[[DictConfig], S], task: Callable[[S], bool], 
     try:
         if not many:
             config = compose(name, overrides)
-            check(config)
+            settings = check(config)
             if dry:
-                print(OmegaConf.to_yaml(config, resolve=True), end="")
+                print(OmegaConf.to_yaml(OmegaConf.create(settings.model_dump())), end="")
                 return 0
         elif dry:
             return _dry_jobs(name, check, overrides)
@@ -111,7 +111,7 @@ def _refused(reason: str) -> bool:
     return False
 
 
-def _dry_jobs(name: str, check: Callable[[DictConfig], object], overrides: Sequence[str]) -> int:
+def _dry_jobs(name: str, check: Callable[[DictConfig], Settings], overrides: Sequence[str]) -> int:
     """Print the jobs of a multirun, and why some would be refused."""
     outcomes: list[bool] = []
 

@@ -25,7 +25,7 @@ from hno.cli.build import (
     streams,
 )  # fmt: skip
 from hno.cli.checkpoints import resumed
-from hno.cli.evaluate import evaluate_policy, solve_tests
+from hno.cli.evaluate import evaluate_policy, solve_tests, unseen_types
 from hno.cli.logs import (
     StepLines,
     finish_wandb,
@@ -99,7 +99,7 @@ def train(settings: TrainSettings) -> bool:
 def _run(settings: TrainSettings, folder: Path, results: Results) -> None:
     fitted = train_operator(settings, folder, results)
     chosen, policy = settings.evaluation, load_policy(fitted.checkpoint)
-    types = list(dict.fromkeys([*policy.types, *parse_types(policy.game, chosen.types, key="evaluation.types")]))
+    types = list(dict.fromkeys([*policy.types, *unseen_types(policy.game, chosen.types, "evaluation.types")]))
     evaluation = OmegaConf.create(plain(chosen))
     cache, workers = cache_folder(settings.data.cache), settings.data.workers
     test = solve_tests(policy.game, types, evaluation, cache, workers, results)

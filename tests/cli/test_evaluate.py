@@ -82,8 +82,7 @@ def test_named_grids_span_the_types_of_the_game(random_checkpoint: Path, name: s
 
 
 def test_default_types_are_the_seen_ones_and_four_unseen(random_checkpoint: Path) -> None:
-    unseen = OmegaConf.load(config_dir() / "evaluate.yaml").unseen
-    types = types_to_evaluate("default", hno.load_policy(random_checkpoint), unseen)
+    types = types_to_evaluate("default", hno.load_policy(random_checkpoint))
     assert types == [(1.0, 1.0), (1.0, 2.0), (2.0, 2.0), (2.0, 4.0), (4.0, 5.0)]
 
 
