@@ -170,4 +170,9 @@ class Trajectory(NamedTuple):
     clearance: Tensor
     """Smallest -constraint over players and time, between the nodes too, shape (B,)."""
     distance: Tensor
-    """Smallest distance between two players over time, m, shape (B,)."""
+    """Smallest distance between two players over time, m, inf for one alone, shape (B,)."""
+
+    @property
+    def collided(self) -> Tensor:
+        """Which episodes collide, shape (B,): those that keep no positive clearance, NaN too."""
+        return ~(self.clearance > 0)

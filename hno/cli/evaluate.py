@@ -6,30 +6,30 @@ import logging
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
-from torch import Tensor
 
 from hno.cli.build import cache_folder
 from hno.cli.checks import finite_number, flag, whole_number
 from hno.cli.config import run_command
 from hno.cli.logs import send_lightning_to_hydra
 from hno.cli.results import Results, config_hash, plain, write_json
-from hno.cli.sections import check_sections, run_sections
-from hno.cli.starts import solve_starts
+from hno.cli.sections import check_sections, evaluation_of, run_sections, table_condition
+from hno.cli.starts import TestLabels
 from hno.cli.summary import report, show
-from hno.control.rollout import Disturbance, control_steps, rollout
-from hno.evaluation.closed_loop import TypeRow, classify, collided, play, tabulate
-from hno.evaluation.comparison import check_same_game, compare
+from hno.control.rollout import control_steps, rollout
+from hno.evaluation.closed_loop import CollisionTable, play
+from hno.evaluation.comparison import PairedComparison, check_same_game
 from hno.evaluation.episodes import EPISODES, episodes
+from hno.evaluation.sections import Evaluation
 from hno.games import Game
 from hno.games.grid import parse_types
 from hno.report.picture import PlotsMissingError, rollout_picture, typical
 from hno.training.checkpoint import OperatorPolicy, load_operator
-from hno.types import Extremal, Trajectory
+from hno.types import Extremal
 
 log = logging.getLogger(__name__)
 
@@ -80,22 +80,25 @@ def _run(config: DictConfig, results: Results) -> None:
     check_evaluation(game, config)
     chosen = [types_to_evaluate(config.theta, policy, config.unseen) for policy in policies]
     types = list(dict.fromkeys(theta for own in chosen for theta in own))
-    for policy in policies:
-        check_sections(policy, types, config)
-    labels = solve_tests(game, types, config, cache_folder(config.cache), config.workers, results)
-    models, outcomes = list[dict[str, Any]](), list[Sequence[Tensor]]()
-    for path, policy in zip(paths, policies, strict=True):
-        log.info("evaluation of %s", path)
-        found = assess(policy, labels, config, results) if models else evaluate_policy(policy, labels, config, results)
-        outcomes.append(found.collided)
-        table = [row._asdict() for row in found.table]
-        names = {**policy.operator.names(), "seed": policy.operator.seed}
-        models.append({"checkpoint": path, **names, "table": table})
-        for name, content in run_sections(policy, labels, config, results):
+    solve = TestLabels(game, types, config, cache_folder(config.cache), config.workers)
+    evaluations = [
+        evaluation_of(path, policy, types, config, solve) for path, policy in zip(paths, policies, strict=True)
+    ]
+    for evaluation in evaluations:
+        check_sections(evaluation)
+    labels = solve_tests(solve, evaluations[0], results)
+    models, played = list[dict[str, Any]](), list[Evaluation]()
+    for evaluation in evaluations:
+        log.info("evaluation of %s", evaluation.name)
+        found, table = (assess if models else evaluate_policy)(evaluation, labels, results)
+        played.append(found)
+        names = {**evaluation.operator.names(), "seed": evaluation.operator.seed}
+        models.append({"checkpoint": evaluation.name, **names, "table": table})
+        for name, content in run_sections(found, results):
             models[-1][name] = content
             results.update(**models[0])
     if len(models) > 1:
-        results.update(models=models, comparison=comparison(paths, types, outcomes))
+        results.update(models=models, comparison=PairedComparison().compute(played))
     results.update(status="finished")
 
 
@@ -117,89 +120,60 @@ def types_to_evaluate(
     return parse_types(game, text, also=("default",))
 
 
-def solve_tests(
-    game: Game,
-    types: Sequence[tuple[float, ...]],
-    settings: DictConfig,
-    cache: Path,
-    workers: int | None,
-    results: Results,
-) -> list[Extremal]:
+def solve_tests(solve: TestLabels, evaluation: Evaluation, results: Results) -> list[Extremal]:
     """Labels of the test starts of every type, from the cache or solved."""
-    labels, seconds = solve_starts(game, types, settings, cache, workers, float(settings.widen))
-    results.time("test_labels", seconds)
-    results.update(test_seed=settings.seed)
+    labels = solve(evaluation.condition)
+    results.time("test_labels", solve.seconds)
+    results.update(test_seed=evaluation.condition.disturbance.seed)
     return labels
 
 
-class Outcome(NamedTuple):
-    """What came of the episodes of a policy."""
-
-    table: list[TypeRow]
-    """Type by type."""
-    played: list[Trajectory]
-    """The episodes of every type."""
-    collided: list[Tensor]
-    """Whether it collides, start by start, one (safe starts,) per type."""
+Assessed = tuple[Evaluation, list[dict[str, Any]]]
+"""An evaluation with its episodes, and the rows of its table."""
 
 
-def evaluate_policy(
-    policy: OperatorPolicy, labels: Sequence[Extremal], settings: DictConfig, results: Results
-) -> Outcome:
-    """Roll out from the starts of the labels, put the table into the results, keep some episodes and draw one."""
-    found = assess(policy, labels, settings, results)
-    write_json(results.path.parent / EPISODES, episodes(policy.game, found.played, labels, settings.clearance))
-    conditions = {name: settings[name] for name in ("clearance", "dt", "widen", "noise", "delay")}
-    results.update(**conditions, table=[row._asdict() for row in found.table], episodes=EPISODES)
-    draw(policy, labels[0], results.path.parent / "rollout.png", settings.dt)
-    return found
+def evaluate_policy(evaluation: Evaluation, labels: Sequence[Extremal], results: Results) -> Assessed:
+    """Play from the starts of the labels, put the table into the results, keep some episodes and draw one."""
+    found, table = assess(evaluation, labels, results)
+    folder, game = results.path.parent, found.game
+    write_json(folder / EPISODES, episodes(game, found.played, labels, found.clearance))
+    conditions = {name: found.options[name] for name in ("clearance", "dt", "widen", "noise", "delay")}
+    results.update(**conditions, constraint_unit=game.constraint_unit, table=table, episodes=EPISODES)
+    draw(found, folder / "rollout.png")
+    return found, table
 
 
-def assess(policy: OperatorPolicy, labels: Sequence[Extremal], settings: DictConfig, results: Results) -> Outcome:
-    """Roll out from the starts of the labels."""
+def assess(evaluation: Evaluation, labels: Sequence[Extremal], results: Results) -> Assessed:
+    """Play from the starts of the labels."""
     began = time.perf_counter()
-    disturbance = Disturbance(settings.noise, settings.delay, settings.seed)
-    played = play(policy.game, policy, labels, settings.dt, disturbance)
-    operator = policy.operator
-    table = tabulate(policy.game, labels, played, operator.seen_types, settings.clearance, operator.field)
-    safe = [classify(found, settings.clearance)[0] for found in labels]
+    disturbance = evaluation.condition.disturbance
+    played = play(evaluation.game, evaluation.policy, labels, evaluation.dt, disturbance)
+    found = evaluation._replace(labels=labels, played=played)
+    table = CollisionTable().compute(found)
     results.time("evaluation", time.perf_counter() - began)
-    return Outcome(table, played, [collided(part)[mask] for part, mask in zip(played, safe, strict=True)])
+    return found, table
 
 
-def comparison(
-    paths: Sequence[str], types: Sequence[tuple[float, ...]], outcomes: Sequence[Sequence[Tensor]]
-) -> dict[str, Any]:
-    """Every model against the first, over all types and type by type."""
-    rows = []
-    for path, other in zip(paths[1:], outcomes[1:], strict=True):
-        pairs = zip(types, outcomes[0], other, strict=True)
-        by_type = [{"theta": theta, **compare(first, second)._asdict()} for theta, first, second in pairs]
-        whole = compare(torch.cat(list(outcomes[0])), torch.cat(list(other)))
-        rows.append({"checkpoint": path, **whole._asdict(), "types": by_type})
-    return {"reference": paths[0], "models": rows}
-
-
-def draw(policy: OperatorPolicy, found: Extremal, path: Path, dt: float, episodes: int = 15) -> None:
-    """Draw a typical episode from the first starts of a label set; without matplotlib, say so."""
-    starts, theta = found.x[:episodes, 0].float(), found.theta[:episodes].float()
-    played = rollout(policy.game, policy, starts, theta, dt)
-    names = policy.operator.names()
+def draw(evaluation: Evaluation, path: Path, episodes: int = 15) -> None:
+    """Draw a typical episode from the first starts of the first type; without matplotlib, say so."""
+    labels, game = evaluation.labels[0], evaluation.game
+    starts, theta = labels.x[:episodes, 0].float(), labels.theta[:episodes].float()
+    played = rollout(game, evaluation.policy, starts, theta, evaluation.dt)
+    names = evaluation.operator.names()
     try:
-        rollout_picture(policy.game, played, theta, path, " / ".join(names.values()), typical(played))
+        rollout_picture(game, played, theta, path, " / ".join(names.values()), typical(played))
     except PlotsMissingError as error:
         log.info("No picture: %s", error)
 
 
 def check_evaluation(game: Game, settings: DictConfig) -> None:
     """Raise ValueError for entries that make no evaluation of the game."""
-    for name, least in (("starts", 1), ("seed", 0), ("delay", 0)):
+    for name, least in (("starts", 1), ("seed", 0)):
         whole_number(name, settings[name], least)
     if settings.get("workers") is not None:
         whole_number("workers", settings.workers, 1)
-    for name in ("clearance", "dt", "noise", "widen"):
+    for name in ("clearance", "dt"):
         finite_number(name, settings[name])
-    if settings.widen == 0:
-        raise ValueError("widen must be a positive number; got 0.")
+    table_condition(game, settings)
     flag("safe", settings.safe)
     control_steps(game, settings.dt)

@@ -21,12 +21,14 @@ from hno.cli.config import run_command
 from hno.cli.evaluate import check_evaluation, evaluate_policy, solve_tests
 from hno.cli.logs import finish_wandb, label_progress, send_lightning_to_hydra
 from hno.cli.media import publish
-from hno.cli.ntk import check_rows, ntk_section
 from hno.cli.results import Results, config_hash, plain
+from hno.cli.sections import evaluation_of, run_sections
+from hno.cli.starts import TestLabels
 from hno.cli.summary import report, show
 from hno.data import GameData
+from hno.data.certificates import safe, summary
 from hno.data.labels import Request, safe_labels_for
-from hno.data.trust import safe, summary
+from hno.evaluation.ntk import check_rows
 from hno.games import Game
 from hno.games.grid import parse_types
 from hno.losses import Scales
@@ -90,16 +92,15 @@ def _run(config: DictConfig, folder: Path, results: Results) -> None:
     check_evaluation(game, settings)
     unseen = game.validate_types(settings.types)
     if settings.ntk:
-        check_rows(build_operator(config, game), settings)
+        check_rows(build_operator(config, game), settings.ntk_rows)
     trainer = fit(config, folder, results)
     policy = load_policy(folder / results.content["checkpoint"])
     types = list(dict.fromkeys([*policy.operator.seen_types, *unseen]))
-    test = solve_tests(game, types, settings, cache_folder(config.data.cache), config.data.workers, results)
-    evaluate_policy(policy, test, settings, results)
-    if settings.ntk:
-        began = time.perf_counter()
-        results.update(ntk=ntk_section(policy.operator, test, settings))
-        results.time("ntk", time.perf_counter() - began)
+    solve = TestLabels(game, types, settings, cache_folder(config.data.cache), config.data.workers)
+    evaluation = evaluation_of(results.content["checkpoint"], policy, types, settings, solve)
+    played, _ = evaluate_policy(evaluation, solve_tests(solve, evaluation, results), results)
+    for name, content in run_sections(played, results):
+        results.update(**{name: content})
     results.update(status="finished")
     publish(trainer.loggers, results.content, folder, trainer.global_step)
 

@@ -19,9 +19,9 @@ from rich.table import Table
 from yaml import YAMLError  # type: ignore[import-untyped]  # yaml has no annotations
 
 from hno.data import labels as label_data
+from hno.data.certificates import GLOBAL_GAP, LOCAL_GAP, summary
 from hno.data.labels import Report, Request, default_cache, label_set, labels_for
 from hno.data.store import LabelFileError
-from hno.data.trust import GLOBAL_GAP, LOCAL_GAP, summary
 from hno.games import Game, make
 from hno.games.grid import parse_types
 from hno.types import Status

@@ -53,6 +53,8 @@ class Game(nn.Module, abc.ABC):
     """Cost rate deep inside the violation set, 1/s."""
     penalty_slope: float = 5.0
     """Steepness of the penalty, 1/m for distance constraints."""
+    constraint_unit: str = "m"
+    """Unit of the constraints, and so of the clearance; m says that they are distances."""
 
     @abc.abstractmethod
     def dynamics(self, x: Tensor, u: Tensor) -> Tensor:

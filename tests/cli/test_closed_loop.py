@@ -12,7 +12,7 @@ from torch import Tensor
 
 from hno.control.rollout import Disturbance
 from hno.data import GameData
-from hno.data.trust import safe
+from hno.data.certificates import safe
 from hno.evaluation import closed_loop
 from hno.operators import ValueOperator
 from hno.training.validation import ClosedLoopValidation, Score

@@ -137,7 +137,7 @@ def test_without_a_safe_start_the_rate_is_not_applicable(command: Command, rando
     assert run.code == 0, run.text
     assert run.results["table"][0]["rate"] is None
     assert "n/a" in run.text
-    assert "No rate (n/a) at (1, 1): of 4 starts none has an equilibrium that keeps 5000 cm" in run.text
+    assert "No rate (n/a) at (1, 1): of 4 starts none has an equilibrium that keeps 50 m" in run.text
 
 
 def test_without_a_safe_start_every_section_says_so(command: Command, random_checkpoint: Path) -> None:
@@ -191,12 +191,13 @@ def test_robustness_is_a_section_on_request(command: Command, random_checkpoint:
     assert run.code == 0, run.text
     rows = {row["name"]: row for row in run.results["robustness"]}
     assert list(rows) == [*OmegaConf.load(config_dir() / "evaluate.yaml").conditions, "heading"]
-    assert rows["heading"]["disturbance"] == {"drift": 0.1, "components": [2]}
+    assert rows["heading"]["condition"] == {"drift": 0.1, "components": [2]}
     plain, table = rows["nominal"], run.results["table"]
     for name in ("safe_starts", "collisions"):
         assert plain[name] == sum(row[name] for row in table)
         assert [entry[name] for entry in plain["types"]] == [row[name] for row in table]
-    assert rows["belief"]["disturbance"] == {"belief": 0.5}
+    assert rows["belief"]["condition"] == {"belief": 0.5}
+    assert rows["symmetric"]["condition"] == {"symmetric": True}
     assert rows["widened"]["median_label_cost"] != plain["median_label_cost"]
     costs = [row["median_excess_cost"] for row in rows.values()]
     assert len(set(costs)) == len(costs), "every condition changes something"
@@ -238,7 +239,7 @@ def test_models_are_compared_on_the_same_starts(command: Command, random_checkpo
     for name in ("starts", "both", "only_reference", "only_other"):
         assert compared[name] == sum(pair[name] for pair in compared["types"])
     assert "random/last.ckpt" in run.text
-    assert "against random/last.ckpt" in run.text
+    assert "compared against random/last.ckpt" in run.text
 
 
 def test_every_model_meets_the_same_safe_starts(

@@ -201,8 +201,8 @@ def test_episodes_are_those_of_the_evaluation(make_validation: Build, name: str,
     found = callback.consider(Trainer(), operator)
     rows = collision_table(game, OperatorPolicy(operator.eval().requires_grad_(False)), labels, [], dt=0.1)
     assert found is not None
-    assert found.collision_rate == pytest.approx(sum(row.collisions for row in rows) / 24)
-    single = [row.median_excess_cost for row in rows]
+    assert found.collision_rate == pytest.approx(sum(row.outcome.collisions for row in rows) / 24)
+    single = [row.outcome.median_excess_cost for row in rows]
     assert min(single) <= found.excess * float(starts_of(labels).cost.median()) <= max(single)
 
 
