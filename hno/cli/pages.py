@@ -5,8 +5,6 @@ from __future__ import annotations
 import shlex
 from pathlib import Path
 
-from hno.report.runs import load
-
 PAGE = "report.html"
 
 
@@ -19,10 +17,11 @@ def write(folder: Path) -> str:
     again = f"python -m hno.report {shlex.quote(str(folder))}"
     try:
         from hno.report.page import write_page
+        from hno.report.runs import load
 
         write_page(load(folder), folder / PAGE)
     except ModuleNotFoundError as error:
-        return f"Page: needs the package {error.name}: pip install 'hno[report]', then {again}"
+        return f"Page: needs the package {error.name}. With it: {again}"
     except Exception as error:
         return f"Page: could not be written ({type(error).__name__}: {error}). Later: {again}"
     return f"Page: {folder / PAGE}"

@@ -24,7 +24,9 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         return _report(chosen)
     except ModuleNotFoundError as error:
-        print(f"Reports need the package {error.name}: pip install 'hno[report]'.", file=sys.stderr)
+        print(
+            f"Reports need the package {error.name}: pip install -e '.[report]' in a checkout of hno.", file=sys.stderr
+        )
     except (NoRunsError, OSError) as error:
         print(error, file=sys.stderr)
     return 1

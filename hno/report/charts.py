@@ -1,16 +1,15 @@
-"""Charts, declared once with Altair: the page fills in data and moves signals, pictures and figures are drawn of them."""
+"""Charts, declared once with Altair for the page, which fills in data and moves signals, and for pictures."""
 
 from __future__ import annotations
 
 import functools
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, Literal
 
 import altair as alt
-import vl_convert
 
-from hno.report.palette import LIGHT, chart_config, signals
+from hno.report import vega
+from hno.report.palette import LIGHT, signals
 
 Layers = alt.LayerChart | alt.FacetChart
 """What Altair makes of charts on top of each other."""
@@ -31,7 +30,7 @@ def _percent(value: str) -> str:
 
 
 LABEL = (
-    "!datum.safe_starts ? '–' : datum.shown === 0 ? '0' : datum.shown < 0.0005 ? '<0.1' : "
+    "!datum.safe_starts ? 'n/a' : datum.shown === 0 ? '0' : datum.shown < 0.0005 ? '<0.1' : "
     "format(100 * datum.shown, datum.shown < 0.0995 ? '.1f' : '.0f')"
 )
 """A rate in %, short enough for a cell; a collision is never rounded away."""
@@ -46,19 +45,17 @@ TIP = (
 )
 
 
-def heat_map(
-    data: Any, cell: int = CELL, legend: alt.Legend | None = None, small: str = "false", counts: bool = False
-) -> Layers:
+def heat_map(data: Any, cell: int = CELL, legend: alt.Legend | None = None, counts: bool = False) -> Layers:
     """Collision rates over the types of two players.
 
     Args:
         data: rows of `recipes.TypeCounts`.
         cell: width of a cell, px.
         legend: of the colours; none by default.
-        small: an expression that says whether cells are too small for a number.
         counts: whether cells tell their numbers of starts too.
 
-    Its signal "bound" is "rate", or "high" for the upper end of the rate's interval.
+    Its signals: "bound" is "rate", or "high" for the upper end of the rate's interval; "small" says whether cells have
+    no room for a number.
     """
     base = (
         alt.Chart(data)
@@ -78,9 +75,9 @@ def heat_map(
     nothing = base.mark_rect(cornerRadius=3, fill="transparent", stroke=alt.expr("muted"), strokeDash=[2, 3])
     seen = base.mark_rect(cornerRadius=3, fill=None, stroke=alt.expr("ink"), strokeWidth=2)
     contrast = "datum.shown > 0 ? (luminance(scale('color', datum.shown)) < 0.2 ? '#fff' : '#111') : muted"
-    size = alt.expr(f"{cell} < 26 || ({small}) ? 8 : 11")
+    size = alt.expr("small ? 8 : 11")
     text = base.mark_text(fill=alt.expr(contrast), fontSize=size, dy=-6 if counts else 0)
-    label = text.transform_filter(f"!({small}) || !(datum.shown > 0)").encode(text="label:N")
+    label = text.transform_filter("!small || !(datum.shown > 0)").encode(text="label:N")
     starts = [text.mark_text(fill=alt.expr(contrast), fontSize=9, dy=8).encode(text="of:N")] if counts else []
     layers = (none, some, nothing.transform_filter("datum.shown === null"), seen.transform_filter("datum.seen"), label)
     return (
@@ -164,7 +161,11 @@ def encounter(
     params = [alt.param(name=name, value=value) for name, value in {"frame": frame, "follow": follow, **whole}.items()]
     params += [alt.param(name=name, expr=expression) for name, expression in _window(up).items()]
     scales = [
-        alt.Scale(domain=[alt.expr(f"{at} - {side} / metre / 2"), alt.expr(f"{at} + {side} / metre / 2")], **_EXACT)
+        alt.Scale(
+            domain=[alt.expr(f"{at} - {side} / metre / 2"), alt.expr(f"{at} + {side} / metre / 2")],
+            nice=False,
+            zero=False,
+        )
         for at, side in (("middle_x", "width"), ("middle_y", "height"))
     ]
     x = alt.X("x:Q", title="x [m]", scale=scales[0], axis=alt.Axis(grid=False, tickCount=6))
@@ -193,9 +194,6 @@ def encounter(
         .properties(width=420, height=170)
         .add_params(*_colors(), *params)
     )
-
-
-_EXACT: dict[str, Any] = {"nice": False, "zero": False}
 
 
 def _window(up: str) -> dict[str, str]:
@@ -255,49 +253,11 @@ def specifications() -> dict[str, Any]:
     """Vega specifications of the page's charts, without data and colours."""
     cells, recipes, points, frames = (alt.NamedData(name) for name in ("cells", "recipes", "points", "frames"))
     return {
-        "heat": compiled(heat_map(cells, small="small")),
-        "comparison": compiled(comparison(recipes)),
-        "log": compiled(learning_curves(points, "log")),
-        "linear": compiled(learning_curves(points, "linear")),
-        "top": compiled(encounter(frames, "y")),
-        "side": compiled(encounter(frames, "z")),
-        "separation": compiled(separation(frames)),
+        "heat": vega.compiled(heat_map(cells)),
+        "comparison": vega.compiled(comparison(recipes)),
+        "log": vega.compiled(learning_curves(points, "log")),
+        "linear": vega.compiled(learning_curves(points, "linear")),
+        "top": vega.compiled(encounter(frames, "y")),
+        "side": vega.compiled(encounter(frames, "z")),
+        "separation": vega.compiled(separation(frames)),
     }
-
-
-def compiled(chart: alt.TopLevelMixin) -> dict[str, Any]:
-    """A chart as Vega, without a configuration of its own."""
-    specification = chart.to_dict()
-    specification.pop("config", None)
-    vega = vl_convert.vegalite_to_vega(specification, vl_version=version())
-    for name in ("config", "background", "$schema"):
-        vega.pop(name, None)
-    return json.loads(json.dumps(vega))
-
-
-def svg(chart: alt.TopLevelMixin) -> str:
-    """A chart with data as SVG, in light colours."""
-    specification = chart.to_dict()
-    specification["config"] = {**chart_config(LIGHT), "background": "white", "aria": False}
-    return vl_convert.vegalite_to_svg(specification, vl_version=version())
-
-
-def png(chart: alt.TopLevelMixin, scale: float = 2) -> bytes:
-    """The same as PNG."""
-    return vl_convert.svg_to_png(svg(chart), scale=scale)
-
-
-def inline(rows: Sequence[Mapping[str, Any]], name: str = "rows") -> alt.InlineData:
-    """Data that a chart carries with it."""
-    return alt.InlineData(values=list(rows), name=name)
-
-
-def version() -> str:
-    """The version of Vega-Lite that Altair writes."""
-    return ".".join(alt.SCHEMA_VERSION.removeprefix("v").split(".")[:2])
-
-
-@functools.cache
-def library() -> str:
-    """Vega-Embed, with Vega inside, as one script that defines `window.vegaEmbed`."""
-    return vl_convert.javascript_bundle("window.vegaEmbed = vegaEmbed;", vl_version=version())

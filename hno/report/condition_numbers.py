@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple, TypedDict
-
-from pydantic import TypeAdapter, ValidationError
+from typing import Any, NamedTuple
 
 from hno.evaluation.format import NOT_AVAILABLE, significant
-from hno.evaluation.sections import Column
-from hno.evaluation.spectrum import Ratio, condition_ratio
+from hno.evaluation.sections import Column, plain
+from hno.evaluation.spectrum import Ratio, Summary, condition_ratio
 from hno.report.records import Run
 from hno.report.tables import Row, Table
 from hno.report.verdicts import at
@@ -18,15 +16,6 @@ KINDS = {"kernel": "J J'", "product": "trunk times branch"}
 """Kernels of a section `ntk`: over all parameters, and the paper's definition."""
 REFERENCE = "tanh"
 """The activation whose condition number is divided by those of the others."""
-
-
-class Kernel(TypedDict):
-    """What `condition_ratio` needs of a spectrum."""
-
-    condition: float
-    cutoff: float
-    rank: int
-    rows: int
 
 
 class Key(NamedTuple):
@@ -42,8 +31,7 @@ class Key(NamedTuple):
     kernel: str
 
 
-_KERNELS = TypeAdapter(Kernel)
-Line = tuple[str, dict[str, Kernel]]
+Line = tuple[str, dict[str, Summary]]
 """Name of the run that a line is about, empty where there is one for every activation; kernels by activation."""
 
 
@@ -52,7 +40,7 @@ def condition_table(runs: Sequence[Run]) -> Table:
 
     Where several runs share all of that and the activation, each has a line of its own, beside activations of one run.
     """
-    found: dict[Key, dict[str, dict[str, Kernel]]] = {}
+    found: dict[Key, dict[str, dict[str, Summary]]] = {}
     for run in runs:
         for key, kernel in _kernels(run):
             found.setdefault(key, {}).setdefault(run.activation, {})[run.name] = kernel
@@ -64,26 +52,25 @@ def condition_table(runs: Sequence[Run]) -> Table:
     return Table(columns, [Row(_values(key, line, others)) for key, line in lines])
 
 
-def _kernels(run: Run) -> Iterator[tuple[Key, Kernel]]:
-    section = run.entries.get("ntk")
-    for entry in section if isinstance(section, list) else []:
+def _kernels(run: Run) -> Iterator[tuple[Key, Summary]]:
+    """Kernels of a run, without those of zeros and without damaged entries."""
+    seed = plain(run.seed)
+    for entry in run.entries.get("ntk") or []:
         for kind, name in KINDS.items():
             try:
-                kernel = _KERNELS.validate_python(entry[kind])
-                types = tuple(map(float, entry["theta"]))
-            except (KeyError, TypeError, ValueError, ValidationError):
+                kernel, types = entry[kind], tuple(map(float, entry["theta"]))
+                known = [kernel[field] for field in ("condition", "cutoff", "rank", "rows")]
+                key = Key(run.game, run.operator, seed, types, int(entry["points"]), kernel["rows"], name)
+            except (KeyError, TypeError, ValueError):
                 continue
-            seed = NOT_AVAILABLE if run.seed is None else str(run.seed)
-            yield Key(run.game, run.operator, seed, types, int(entry.get("points", 0)), kernel["rows"], name), kernel
+            if all(known):
+                yield key, kernel
 
 
-def _lines(found: Mapping[str, Mapping[str, Kernel]]) -> list[Line]:
+def _lines(found: Mapping[str, Mapping[str, Summary]]) -> list[Line]:
     single = {name: next(iter(runs.values())) for name, runs in found.items() if len(runs) == 1}
     several: list[Line] = [
-        (run, {**single, name: kernel})
-        for name, runs in found.items()
-        if len(runs) > 1
-        for run, kernel in runs.items()
+        (run, {**single, name: kernel}) for name, runs in found.items() if len(runs) > 1 for run, kernel in runs.items()
     ]
     return several or [("", single)]
 
@@ -95,11 +82,11 @@ def _values(key: Key, line: Line, others: Sequence[str]) -> dict[str, Any]:
     return {**known, **{name: _condition(kernel) for name, kernel in kernels.items()}, **ratios}
 
 
-def _condition(found: Kernel) -> str:
+def _condition(found: Summary) -> str:
     return significant(found["condition"]) if found["rank"] == found["rows"] else f"> {1 / found['cutoff']:.3g}"
 
 
-def _ratio(over: Kernel | None, under: Kernel | None) -> str:
+def _ratio(over: Summary | None, under: Summary | None) -> str:
     found = Ratio(None, "n/a") if over is None or under is None else condition_ratio(over, under)
     bound = "" if found.bound == "=" else f"{found.bound} "
     return NOT_AVAILABLE if found.value is None else f"{bound}{significant(found.value)}"

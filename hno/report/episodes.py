@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from hno.report.episode import Array, Episode
 from hno.report.page_data import identity
-from hno.report.records import Array, Episode, Run
+from hno.report.records import Run
 from hno.report.verdicts import at, clearance
 
 MOST = 400
@@ -87,7 +88,8 @@ def described(run: Run, found: Episode) -> str:
         between = " (between the frames shown)"
     cost, label = ("n/a" if value is None else f"{value:.1f}" for value in (found.cost, found.label_cost))
     near = clearance(found, run.constraint_unit)
-    return f"{run.name}, types {at(found.theta)}, {found.kind}: {near}{between}. Joint cost {cost}, the equilibrium's {label}."
+    costs = f"Joint cost {cost}, the equilibrium's {label}."
+    return f"{run.name}, types {at(found.theta)}, {found.kind}: {near}{between}. {costs}"
 
 
 def ranked(runs: Sequence[Run]) -> list[tuple[Run, Episode]]:

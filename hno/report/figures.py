@@ -11,11 +11,11 @@ from typing import Any
 import altair as alt
 
 from hno.data.store import replace_whole
-from hno.report import charts, episodes
+from hno.report import charts, episodes, vega
 from hno.report.condition_numbers import condition_table
+from hno.report.episode import Episode
 from hno.report.page_data import comparison
-from hno.report.pictures import LEGEND, WIDE, view
-from hno.report.records import Episode
+from hno.report.pictures import LEGEND, WIDE, sides, view
 from hno.report.recipes import Recipe, best, headline, recipes
 from hno.report.runs import Sweep
 from hno.report.tables import CACHED, COST, Table, recipe_table
@@ -51,8 +51,8 @@ def _writer(text: str) -> Callable[[Path], object]:
 
 
 def _draw(chart: alt.TopLevelMixin, path: Path) -> list[Path]:
-    picture = charts.png(chart)
-    replace_whole(path.with_suffix(".svg"), _writer(charts.svg(chart)))
+    picture = vega.png(chart)
+    replace_whole(path.with_suffix(".svg"), _writer(vega.svg(chart)))
     replace_whole(path.with_suffix(".png"), lambda draft: draft.write_bytes(picture))
     return [path.with_suffix(".svg"), path.with_suffix(".png")]
 
@@ -62,7 +62,7 @@ def collision_figure(found: Sequence[Recipe]) -> alt.TopLevelMixin | None:
     shown = [recipe for recipe in found if recipe.types and all(len(one.theta) == 2 for one in recipe.types)]
     maps = [
         charts.heat_map(
-            charts.inline([one._asdict() for one in recipe.types], f"cells_{k}"), legend=None if k else LEGEND
+            vega.inline([one._asdict() for one in recipe.types], f"cells_{k}"), legend=None if k else LEGEND
         ).properties(title=alt.TitleParams(recipe.name, subtitle=_counts(recipe), anchor="start"))
         for k, recipe in enumerate(shown)
     ]
@@ -82,7 +82,7 @@ def _counts(recipe: Recipe) -> list[str]:
 def comparison_figure(found: Sequence[Recipe]) -> alt.TopLevelMixin | None:
     """Collision rates of the recipes of a game; None where nothing was played."""
     rows = comparison(found)
-    return charts.comparison(charts.inline(rows)).properties(width=WIDE) if rows else None
+    return charts.comparison(vega.inline(rows)).properties(width=WIDE) if rows else None
 
 
 def encounter_figures(found: Sequence[Recipe]) -> dict[str, alt.TopLevelMixin]:
@@ -102,9 +102,8 @@ def encounter_figures(found: Sequence[Recipe]) -> dict[str, alt.TopLevelMixin]:
 def _views(found: Episode, recipe: Recipe) -> dict[str, alt.TopLevelMixin]:
     near = clearance(found, recipe.runs[0].constraint_unit)
     title = f"{recipe.name}, types {at(found.theta)}, {found.kind}: {near}"
-    sides = {"top": "y", "side": "z"} if found.positions.shape[2] == 3 else {"top": "y"}
-    frame = episodes.closest(found)
-    return {f"{found.kind}_{side}": view(found, up, frame, True, title) for side, up in sides.items()}
+    names, frame = {"y": "top", "z": "side"}, episodes.closest(found)
+    return {f"{found.kind}_{names[up]}": view(found, up, frame, True, title) for up in sides(found)}
 
 
 def markdown(sweep: Sweep, found: Sequence[Recipe]) -> str:

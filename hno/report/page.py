@@ -16,8 +16,8 @@ from hno.data.store import replace_whole
 from hno.evaluation.format import NOT_AVAILABLE, interval, percent
 from hno.evaluation.outcome import Pooled
 from hno.evaluation.sections import plain
-from hno.report import episodes, page_data, verdicts
-from hno.report.charts import library, specifications
+from hno.report import episodes, page_data, vega, verdicts
+from hno.report.charts import specifications
 from hno.report.palette import DARK, LIGHT, chart_config, signals, variables
 from hno.report.recipes import Recipe, TypeCounts, best, by_type, headline, pool, recipes
 from hno.report.records import Run
@@ -71,12 +71,12 @@ def render(sweep: Sweep, refresh: float | None = None) -> str:
         **_origin(sweep, found),
         "cards": cards,
         "curve_games": sorted({entry["game"] for entry in curves}),
-        "episodes_shown": len(data["episodes"]),
+        "episodes_shown": min(len(played), episodes.MOST),
         "episodes_total": len(played),
         "refresh": refresh,
         "variables": {name: Markup(variables(palette)) for name, palette in themes.items()},
         "style": Markup(_asset("page.css")),
-        "vega": Markup(_script(library())),
+        "vega": Markup(_script(vega.library())),
         "script": Markup(_script("\n".join(_asset(name) for name in SCRIPTS))),
         "data": embedded(data),
     }
@@ -167,7 +167,9 @@ def _cards(runs: Sequence[Run], found: Sequence[Recipe]) -> list[dict[str, Any]]
     """Heat maps of recipes over their seeds, safest first, then those of single runs."""
     ordered = sorted((one for one in found if one.types), key=lambda one: (one.game, one.pooled.rate or 0.0))
     names = {run.name: recipe.name for recipe in found for run in recipe.runs}
-    pooled = [_card(f"r{k}", one, one.name, verdicts.seeds(one), one.types, one.pooled) for k, one in enumerate(ordered)]
+    pooled = [
+        _card(f"r{k}", one, one.name, verdicts.seeds(one), one.types, one.pooled) for k, one in enumerate(ordered)
+    ]
     single = [
         _card(f"s{k}", run, names.get(run.name, run.operator), f"seed {run.seed}", by_type(run.table), pool(run.table))
         for k, run in enumerate(runs)

@@ -12,9 +12,10 @@ import numpy as np
 from PIL import Image
 
 from hno.data.store import replace_whole
-from hno.report import charts, episodes
+from hno.report import charts, episodes, vega
+from hno.report.episode import Episode
 from hno.report.recipes import by_type
-from hno.report.records import Episode, type_row
+from hno.report.records import type_row
 
 WIDE, HIGH = 420, 170
 """Size of a view of an encounter, px."""
@@ -37,14 +38,16 @@ def collision_map(table: Sequence[Any], path: Path, title: str) -> None:
     if not counts or any(len(one.theta) != 2 for one in counts):
         raise ValueError("A map over types needs evaluated types of two players.")
     rows = [one._asdict() for one in counts]
-    chart = charts.heat_map(charts.inline(rows), cell=52, legend=LEGEND, counts=True)
-    picture = charts.png(chart.properties(title=_title(title, "collisions of safe starts in %; framed: types with labels")))
+    chart = charts.heat_map(vega.inline(rows), cell=52, legend=LEGEND, counts=True)
+    picture = vega.png(
+        chart.properties(title=_title(title, "collisions of safe starts in %; framed: types with labels"))
+    )
     replace_whole(path, lambda draft: draft.write_bytes(picture))
 
 
 def view(found: Episode, up: Literal["y", "z"], frame: int, follow: bool, title: str = "") -> charts.Layers:
     """An episode at a frame, from above ("y") or from the side ("z"). See `charts.encounter`."""
-    data = charts.inline(episodes.frames(found), "frames")
+    data = vega.inline(episodes.frames(found), "frames")
     whole = episodes.whole(found, "xyz".index(up))
     chart = charts.encounter(data, up, frame, follow, whole).properties(width=WIDE, height=HIGH)
     return chart.properties(title=_title(title)) if title else chart
@@ -61,7 +64,7 @@ def rollout_picture(found: Episode, path: Path, title: str) -> None:
     frame = episodes.closest(found)
     drawn = _views(found, frame, title)
     if episodes.distances(found) is not None:
-        data = charts.inline(episodes.frames(found), "frames")
+        data = vega.inline(episodes.frames(found), "frames")
         drawn.append(charts.separation(data, frame, episodes.reach(found)).properties(width=WIDE))
     picture = _stacked(drawn)
     replace_whole(path, lambda draft: picture.save(draft, format="PNG"))
@@ -89,14 +92,18 @@ def animate(found: Episode, path: Path, title: str) -> None:
     )
 
 
+def sides(found: Episode) -> Sequence[Literal["y", "z"]]:
+    """The second axis of every view."""
+    return ("y", "z") if found.positions.shape[2] == 3 else ("y",)
+
+
 def _views(found: Episode, frame: int, title: str) -> list[charts.Layers]:
-    sides: Sequence[Literal["y", "z"]] = ("y", "z") if found.positions.shape[2] == 3 else ("y",)
-    return [view(found, up, frame, follow=False, title="" if k else title) for k, up in enumerate(sides)]
+    return [view(found, up, frame, follow=False, title="" if k else title) for k, up in enumerate(sides(found))]
 
 
 def _stacked(drawn: Sequence[charts.Layers], scale: float = 2) -> Image.Image:
     """Charts below each other."""
-    images = [Image.open(io.BytesIO(charts.png(chart, scale))).convert("RGB") for chart in drawn]
+    images = [Image.open(io.BytesIO(vega.png(chart, scale))).convert("RGB") for chart in drawn]
     size = max(image.width for image in images), sum(image.height for image in images)
     picture, top = Image.new("RGB", size, "white"), 0
     for image in images:

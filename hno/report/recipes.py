@@ -205,7 +205,8 @@ def _recipe(names: tuple[str, ...], variant: str, runs: Sequence[Run]) -> Recipe
     failed = sum(run.status == "failed" for run in runs)
     unfinished = len(runs) - len(counted) - len(repeated) - failed
     special = ", ".join(sorted({text for run in counted for text in (_constants(run), run.conditions)} - {""}))
-    return Recipe(*names, variant, special, counted, repeated, unfinished, failed)
+    game, operator, activation = names
+    return Recipe(game, operator, activation, variant, special, counted, repeated, unfinished, failed)
 
 
 def _constants(run: Run) -> str:

@@ -1,4 +1,4 @@
-"""What a run's files hold, as typed records: results.json, episodes.json and csv/metrics.csv."""
+"""What results.json and csv/metrics.csv hold, as typed records."""
 
 from __future__ import annotations
 
@@ -7,18 +7,16 @@ import json
 import math
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
-from pydantic import BaseModel, BeforeValidator, ConfigDict, SkipValidation, TypeAdapter, ValidationError
+from pydantic import BaseModel, ConfigDict, SkipValidation, TypeAdapter, ValidationError
 
 from hno.evaluation.closed_loop import TypeRow
 from hno.evaluation.format import NOT_AVAILABLE
 from hno.evaluation.outcome import Outcome
+from hno.report.episode import Episode
 
 T = TypeVar("T")
-Array = NDArray[np.float64]
 Curves = dict[str, list[tuple[int, float]]]
 """Metric -> step and value."""
 PLAY = ("clearance", "dt", "widen", "noise", "delay")
@@ -27,33 +25,6 @@ PLAY = ("clearance", "dt", "widen", "noise", "delay")
 
 class UnreadableError(ValueError):
     """A file that is not what it should be; the message says what is wrong with it."""
-
-
-def _array(value: Any) -> Array:
-    return np.asarray(value, dtype=np.float64)
-
-
-class Episode(BaseModel):
-    """One closed-loop episode; F frames, P players, d dimensions."""
-
-    model_config = ConfigDict(frozen=True, arbitrary_types_allowed=True)
-
-    theta: tuple[float, ...]
-    kind: str = ""
-    """ "worst" (smallest clearance of its type) or "typical" (median clearance)."""
-    collided: bool = False
-    clearance: float | None
-    """Smallest value of -constraint."""
-    cost: float | None = None
-    label_cost: float | None = None
-    t: Annotated[Array, BeforeValidator(_array)]
-    """Time, s, (F,)."""
-    positions: Annotated[Array, BeforeValidator(_array)]
-    """m, (F, P, d)."""
-    radius: Annotated[Array, BeforeValidator(_array)] | None = None
-    """Distance below which it is a collision, m, (F,); None where the constraint is no distance."""
-    label_positions: Annotated[Array, BeforeValidator(_array)] | None = None
-    """Positions along the equilibrium from the same start, m, (F, P, d)."""
 
 
 class Run(BaseModel):
@@ -194,34 +165,6 @@ def sentence(error: ValidationError) -> str:
     place = ".".join(str(step) for step in first["loc"]) or "content"
     found = "" if first["type"] == "missing" else f", got {first['input']!r:.60}"
     return f"{place}: {first['msg'][0].lower()}{first['msg'][1:]}{found}"
-
-
-def episode(content: Any) -> Episode:
-    """An entry of episodes.json, up to its first frame that is not finite.
-
-    Raises:
-        ValueError: arrays are missing or do not fit.
-    """
-    found = Episode.model_validate(content)
-    t, positions = found.t, found.positions
-    shapes = [None if array is None else array.shape for array in (t, positions, found.radius, found.label_positions)]
-    if t.ndim != 1 or positions.ndim != 3 or positions.shape[2] not in (2, 3):
-        raise ValueError(f"times and positions have shapes {shapes[:2]}, expected (F,) and (F, P, 2 or 3)")
-    if positions.shape[0] != len(t) or shapes[2] not in (None, t.shape) or shapes[3] not in (None, positions.shape):
-        raise ValueError(f"times, positions, radius and equilibrium have shapes {shapes}")
-    sound = np.isfinite(t) & np.isfinite(positions).all((1, 2))
-    sound &= True if found.radius is None else np.isfinite(found.radius)
-    end = len(t) if sound.all() else int(sound.argmin())
-    if end == 0:
-        raise ValueError("it has no finite frame")
-    return found.model_copy(update={name: _first(getattr(found, name), end) for name in _ARRAYS})
-
-
-_ARRAYS = ("t", "positions", "radius", "label_positions")
-
-
-def _first(values: Array | None, end: int) -> Array | None:
-    return None if values is None or not np.isfinite(values[:end]).all() else values[:end]
 
 
 def curves(path: Path) -> Curves:

@@ -9,9 +9,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from hno.report.episode import Episode, episode
 from hno.report.hydra_files import command_of, read_yaml, sweep_of
-from hno.report.records import Curves, Episode, Run, UnreadableError, curves, each, episode, read_json, read_results
-from hno.report.records import run_of as run_record
+from hno.report.records import Curves, Run, UnreadableError, curves, each, read_json, read_results, run_of
 
 RESULTS, METRICS, EPISODES = "results.json", "csv/metrics.csv", "episodes.json"
 
@@ -100,7 +100,7 @@ def read_runs(folder: Path, name: str) -> list[Run]:
 
 
 def _run(folder: Path, name: str, content: Mapping[str, Any]) -> Run:
-    run = run_record(content, RESULTS)
+    run = run_of(content, RESULTS)
     settings, said = _settings(folder, run)
     metrics, missed = _curves(folder / METRICS)
     played, unplayed = _episodes(folder, content.get("episodes"))

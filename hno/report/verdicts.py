@@ -6,8 +6,9 @@ from collections.abc import Sequence
 
 from hno.evaluation.format import NOT_AVAILABLE, counted, interval, percent, signed, types
 from hno.evaluation.outcome import Pooled
+from hno.report.episode import Episode
 from hno.report.recipes import Recipe, Spread, best, rivals
-from hno.report.records import Episode, Run
+from hno.report.records import Run
 from hno.report.runs import Sweep
 
 

@@ -100,8 +100,8 @@ def make_results(
             }
             for theta in sorted(CORNERS)
         ],
-        "clearance": 0.02, "constraint_unit": "m", "dt": 0.02, "widen": 1.0, "noise": 0.0, "delay": 0, "test_seed": 1000,
-        "table": table, "episodes": "episodes.json",
+        "clearance": 0.02, "constraint_unit": "m", "dt": 0.02, "widen": 1.0, "noise": 0.0, "delay": 0,
+        "test_seed": 1000, "table": table, "episodes": "episodes.json",
         "versions": {"hno": "0.1.0", "python": "3.11.2", "torch": "2.13.0", "lightning": "2.6.6"}, **entries,
     }  # fmt: skip
 

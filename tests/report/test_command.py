@@ -61,7 +61,7 @@ def test_a_missing_package_is_named_with_the_remedy(tmp_path, monkeypatch, capsy
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "altair", None)
     assert main([str(tmp_path)]) == 1
-    assert "altair: pip install 'hno[report]'" in capsys.readouterr().err
+    assert "altair: pip install -e '.[report]' in a checkout" in capsys.readouterr().err
 
 
 def test_watching_follows_the_sweep_and_leaves_a_page_at_rest(tmp_path, monkeypatch, capsys):

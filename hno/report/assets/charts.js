@@ -46,7 +46,7 @@ function drawHeat(host) {
   const cells = DATA.maps[host.dataset.of];
   const columns = new Set(cells.map((cell) => cell.theta[0])).size;
   const step = Math.max(13, Math.min(38, Math.floor((host.clientWidth - 44) / columns)));
-  draw(host, "heat", { cells }, { x_step: step, y_step: step, small: step < 20, bound: $("shown").value });
+  draw(host, "heat", { cells }, { x_step: step, y_step: step, small: step < 26, bound: $("shown").value });
 }
 
 function drawComparison(host) {
