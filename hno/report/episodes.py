@@ -59,7 +59,7 @@ def frames(found: Episode) -> list[dict[str, Any]]:
 
 
 def whole(found: Episode, up: int) -> dict[str, float]:
-    """Signals of `charts.encounter`: everything that happens, with room for discs.
+    """Signals of `episode_charts.encounter`: everything that happens, with room for discs.
 
     Args:
         found: the episode.

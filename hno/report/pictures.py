@@ -14,6 +14,7 @@ from PIL import Image
 from hno.data.store import replace_whole
 from hno.report import charts, episodes, vega
 from hno.report.episode import Episode
+from hno.report.episode_charts import encounter, separation
 from hno.report.recipes import by_type
 from hno.report.records import type_row
 
@@ -45,11 +46,11 @@ def collision_map(table: Sequence[Any], path: Path, title: str) -> None:
     replace_whole(path, lambda draft: draft.write_bytes(picture))
 
 
-def view(found: Episode, up: Literal["y", "z"], frame: int, follow: bool, title: str = "") -> charts.Layers:
-    """An episode at a frame, from above ("y") or from the side ("z"). See `charts.encounter`."""
+def view(found: Episode, up: Literal["y", "z"], frame: int, follow: bool, title: str = "") -> vega.Layers:
+    """An episode at a frame, from above ("y") or from the side ("z"). See `episode_charts.encounter`."""
     data = vega.inline(episodes.frames(found), "frames")
     whole = episodes.whole(found, "xyz".index(up))
-    chart = charts.encounter(data, up, frame, follow, whole).properties(width=WIDE, height=HIGH)
+    chart = encounter(data, up, frame, follow, whole).properties(width=WIDE, height=HIGH)
     return chart.properties(title=_title(title)) if title else chart
 
 
@@ -65,7 +66,7 @@ def rollout_picture(found: Episode, path: Path, title: str) -> None:
     drawn = _views(found, frame, title)
     if episodes.distances(found) is not None:
         data = vega.inline(episodes.frames(found), "frames")
-        drawn.append(charts.separation(data, frame, episodes.reach(found)).properties(width=WIDE))
+        drawn.append(separation(data, frame, episodes.reach(found)).properties(width=WIDE))
     picture = _stacked(drawn)
     replace_whole(path, lambda draft: picture.save(draft, format="PNG"))
 
@@ -97,11 +98,11 @@ def sides(found: Episode) -> Sequence[Literal["y", "z"]]:
     return ("y", "z") if found.positions.shape[2] == 3 else ("y",)
 
 
-def _views(found: Episode, frame: int, title: str) -> list[charts.Layers]:
+def _views(found: Episode, frame: int, title: str) -> list[vega.Layers]:
     return [view(found, up, frame, follow=False, title="" if k else title) for k, up in enumerate(sides(found))]
 
 
-def _stacked(drawn: Sequence[charts.Layers], scale: float = 2) -> Image.Image:
+def _stacked(drawn: Sequence[vega.Layers], scale: float = 2) -> Image.Image:
     """Charts below each other."""
     images = [Image.open(io.BytesIO(vega.png(chart, scale))).convert("RGB") for chart in drawn]
     size = max(image.width for image in images), sum(image.height for image in images)

@@ -10,7 +10,15 @@ from typing import Any
 import altair as alt
 import vl_convert
 
-from hno.report.palette import LIGHT, chart_config
+from hno.report.palette import LIGHT, chart_config, signals
+
+Layers = alt.LayerChart | alt.FacetChart
+"""What Altair makes of charts on top of each other."""
+
+
+def colors() -> list[alt.Parameter]:
+    """Colours that a chart asks for by name; the page replaces them in the dark."""
+    return [alt.param(name=name, value=color) for name, color in signals(LIGHT).items()]
 
 
 def compiled(chart: alt.TopLevelMixin) -> dict[str, Any]:

@@ -74,7 +74,7 @@ def command(
     no_pages: None,
 ) -> Command:
     """Run train.py or evaluate.py in this process, as the command line would, but without pictures and pages."""
-    monkeypatch.setattr(evaluate, "draw", lambda *arguments: None)
+    monkeypatch.setattr(evaluate, "draw_typical", lambda *arguments: None)
     mains = {"train": train.main, "evaluate": evaluate.main}
 
     def run(name: str, *overrides: str, folder: Path = tmp_path / "run") -> Outcome:

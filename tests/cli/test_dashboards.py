@@ -16,6 +16,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from hno.cli import media
 from hno.cli.media import numbers, publish
+from hno.report import pictures
 from tests.cli.conftest import SMOKE, Command, refused
 from tests.cli.wandb_file import offline_run
 from tests.report.tables import episode, type_row
@@ -86,7 +87,7 @@ def test_wandb_gets_pictures_and_the_worst_stored_episode_animated(command: Comm
     monkeypatch.setattr("hno.cli.train.publish", with_episodes)
     titles = []
     monkeypatch.setattr(
-        media, "animate", lambda shown, path, title: titles.append(title) or path.write_bytes(b"GIF89a")
+        pictures, "animate", lambda shown, path, title: titles.append(title) or path.write_bytes(b"GIF89a")
     )
     run = command("train", *SMOKE, "trainer.max_steps=1", "logger=wandb")
     assert run.code == 0, run.text
@@ -121,7 +122,7 @@ def test_a_picture_that_fails_costs_a_warning_not_the_run(
     def broken(*arguments: object) -> None:
         raise TypeError("no such colour")
 
-    monkeypatch.setattr(media, "collision_map", broken)
+    monkeypatch.setattr(pictures, "collision_map", broken)
     board = TensorBoardLogger(tmp_path, name="", version="tensorboard")
     publish([board], results(type_row((1, 1), 0, 10)), tmp_path, 1)
     assert [(r.levelno, "TypeError: no such colour" in r.getMessage()) for r in caplog.records] == [

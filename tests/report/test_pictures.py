@@ -7,8 +7,9 @@ from typing import Any
 import pytest
 from PIL import Image
 
-from hno.report import charts, pictures, vega
+from hno.report import pictures, vega
 from hno.report.episode import episode as read
+from hno.report.episode_charts import separation
 from hno.report.pictures import animate, collision_map, rollout_picture
 from tests.report.tables import episode, type_row
 
@@ -68,7 +69,7 @@ def test_frames_show_the_time_and_the_paths_so_far(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(
         pictures, "view", lambda found, up, frame, follow, title="": seen.append((title, frame)) or view(found, frame)
     )
-    view = lambda found, frame: charts.separation(vega.inline([]), frame)  # noqa: E731
+    view = lambda found, frame: separation(vega.inline([]), frame)  # noqa: E731
     animate(read(episode((1, 5), 0.3, frames=3)), tmp_path / "worst.gif", "a game")
     assert seen == [(f"a game\nt = {0.5 * k:.2f} s", k) for k in range(3)]
 
