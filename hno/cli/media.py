@@ -1,4 +1,4 @@
-"""What dashboards get at the end of a run: numbers by type, a map over types, episodes as picture and animation."""
+"""What dashboards get at the end of a run: numbers by type, a map over types, pictures of episodes."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def publish(loggers: Sequence[Logger], results: Mapping[str, Any], folder: Path,
     """Send what came of a run to its loggers. One that refuses, or a failed picture, costs a warning, not the run.
 
     Args:
-        loggers: all of them get the numbers; W&B pictures, an animation and the table too; TensorBoard pictures.
+        loggers: all of them get the numbers; W&B pictures and the table too; TensorBoard pictures.
         results: content of results.json.
         folder: the run's; pictures are written there.
         step: the last one of the training.
@@ -76,9 +76,9 @@ def draw(results: Mapping[str, Any], folder: Path, kinds: Collection[type[Logger
 
         worst = worst_episode(results, folder) if WandbLogger in kinds else None
         if worst is not None:
-            made["worst_episode"] = folder / "worst_episode.gif"
+            made["worst_episode"] = folder / "worst_episode.png"
             heading = f"{title}\nsmallest clearance, {number(worst['clearance'])} m at ({name_of(worst['theta'])})"
-            pictures.animate(episode(worst), made["worst_episode"], heading)
+            pictures.rollout_picture(episode(worst), made["worst_episode"], heading)
         if not {WandbLogger, TensorBoardLogger}.isdisjoint(kinds):
             made["collision_map"] = folder / "collision_map.png"
             pictures.collision_map(results["table"], made["collision_map"], title)
@@ -128,8 +128,7 @@ def _send_to_wandb(logger: WandbLogger, results: Mapping[str, Any], pictures: Ma
     nobody = "n/a" if whole.rate is None else "none"
     logger.experiment.summary["test/worst_theta"] = name_of(whole.worst_theta) if whole.worst_theta else nobody
     for name, path in pictures.items():
-        send = logger.log_video if path.suffix == ".gif" else logger.log_image
-        send(name, [str(path)], step)
+        logger.log_image(name, [str(path)], step)
     columns = list(results["table"][0]) if results["table"] else []
     logger.log_table("types", columns, [[str(row[name]) for name in columns] for row in results["table"]], step=step)
 
@@ -140,8 +139,7 @@ def _send_to_tensorboard(
     head = {name: str(results.get(name)) for name in ("game", "operator", "activation", "seed", "config_hash")}
     logger.log_hyperparams(head, numbers(results), step)
     for name, path in pictures.items():
-        if path.suffix == ".png":
-            from numpy import asarray
-            from PIL.Image import open as read
+        from numpy import asarray
+        from PIL.Image import open as read
 
-            logger.experiment.add_image(name, asarray(read(path)), step, dataformats="HWC")
+        logger.experiment.add_image(name, asarray(read(path)), step, dataformats="HWC")

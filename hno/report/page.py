@@ -7,19 +7,19 @@ from collections import Counter
 from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jinja2
 from markupsafe import Markup
 
 from hno.data.store import replace_whole
-from hno.evaluation.format import NOT_AVAILABLE, interval, percent
+from hno.evaluation.format import interval, percent
 from hno.evaluation.outcome import Pooled
 from hno.evaluation.sections import plain
 from hno.report import episodes, page_data, vega, verdicts
 from hno.report.charts import specifications
 from hno.report.palette import DARK, LIGHT, chart_config, signals, variables
-from hno.report.recipes import Recipe, TypeCounts, best, by_type, headline, pool, recipes
+from hno.report.recipes import Recipe, TypeCounts, by_type, headline, pool, recipes
 from hno.report.records import Run
 from hno.report.runs import Sweep
 from hno.report.tables import (
@@ -58,7 +58,7 @@ def render(sweep: Sweep, refresh: float | None = None) -> str:
     curves = page_data.learning_curves(found, sweep.runs)
     themes = {"light": LIGHT, "dark": DARK}
     data = {
-        "maps": {card["id"]: page_data.cells(card["types"]) for card in cards},
+        "maps": {card.id: page_data.cells(card.types) for card in cards},
         "comparison": page_data.comparison(found),
         "curves": curves,
         "episodes": [episodes.playable(run, one) for run, one in played[: episodes.MOST]],
@@ -66,20 +66,24 @@ def render(sweep: Sweep, refresh: float | None = None) -> str:
         "themes": {name: {"config": chart_config(p), "signals": signals(p)} for name, p in themes.items()},
         "refresh": refresh,
     }
+    unfinished = [run for run in sweep.runs if not run.finished]
+    sections = [(run.name, names_of(run, "any"), section_tables(run)) for run in sweep.runs]
     content = {
-        **_results(sweep, found),
-        **_origin(sweep, found),
-        "cards": cards,
+        "sweep": sweep, "recipes": found, "games": _games(found), "cards": cards, "unfinished": unfinished,
+        "remarks": sum(len(run.notes) for run in sweep.runs) + sum(len(recipe.repeated) for recipe in found),
+        "filters": {name: _choices(sweep.runs, name) for name in ("game", "operator", "activation", "seed")},
+        "compared_games": sorted({recipe.game for recipe in found if recipe.pooled.safe_starts}),
         "curve_games": sorted({entry["game"] for entry in curves}),
-        "episodes_shown": min(len(played), episodes.MOST),
-        "episodes_total": len(played),
-        "refresh": refresh,
+        "recipe_table": recipe_table(found), "run_table": run_table(sweep.runs), "labels": label_tables(sweep.runs),
+        "sections": [entry for entry in sections if entry[2]], "common": _common(sweep.runs),
+        "differing": _differing(sweep.runs, found), "versions": _versions(sweep.runs), "cached": CACHED,
+        "episodes_shown": min(len(played), episodes.MOST), "episodes_total": len(played), "refresh": refresh,
         "variables": {name: Markup(variables(palette)) for name, palette in themes.items()},
-        "style": Markup(_asset("page.css")),
-        "vega": Markup(_script(vega.library())),
-        "script": Markup(_script("\n".join(_asset(name) for name in SCRIPTS))),
-        "data": embedded(data),
-    }
+        "style": Markup(_asset("page.css")), "vega": Markup(_script(vega.library())),
+        "script": Markup(_script("\n".join(_asset(name) for name in SCRIPTS))), "data": embedded(data),
+        "jobs": verdicts.jobs, "why": verdicts.why, "seeds": verdicts.seeds, "at": verdicts.at,
+        "share": verdicts.share, "quality": verdicts.quality, "interval": interval, "percent": percent,
+    }  # fmt: skip
     environment = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
@@ -104,90 +108,54 @@ def _script(text: str) -> str:
     return f"(() => {{\n{closed}\n}})();"
 
 
-def _results(sweep: Sweep, found: Sequence[Recipe]) -> dict[str, Any]:
-    """What came of the runs, and which of them say nothing."""
-    runs = sweep.runs
-    sections = [(run.name, names_of(run, "any"), section_tables(run)) for run in runs]
-    return {
-        "name": sweep.name,
-        "jobs": verdicts.jobs(sweep),
-        "games": _games(found),
-        "filters": {name: _choices(runs, name) for name in ("game", "operator", "activation", "seed")},
-        "cached": CACHED,
-        "recipe_table": recipe_table(found),
-        "run_table": run_table(runs),
-        "problems": [(run.name, run.status, verdicts.why(run)) for run in runs if not run.finished],
-        "skipped": sweep.skipped,
-        "notes": [(run.name, note) for run in runs for note in run.notes],
-        "repeated": [run.name for recipe in found for run in recipe.repeated],
-        "compared_games": sorted({recipe.game for recipe in found if recipe.pooled.safe_starts}),
-        "sections": [entry for entry in sections if entry[2]],
-        "labels": label_tables(runs),
-    }
+class Game(NamedTuple):
+    """One card of the summary."""
+
+    name: str
+    best: Recipe | None
+    """None where nothing was played."""
+    sentences: list[str]
+    """About the best recipe of every kind of conditions."""
 
 
-def _origin(sweep: Sweep, found: Sequence[Recipe]) -> dict[str, Any]:
-    """Settings, versions and command lines."""
-    common, differing = _settings(sweep.runs, found)
-    return {
-        "common": common,
-        "differing": differing,
-        "versions": _versions(sweep.runs),
-        "command": sweep.command,
-        "commands": [(run.name, run.command or f"{NOT_AVAILABLE}: no .hydra/overrides.yaml") for run in sweep.runs],
-    }
-
-
-def _games(found: Sequence[Recipe]) -> list[dict[str, Any]]:
-    """One card of the summary for every game."""
-    judged = verdicts.verdicts(found)
-    chosen: dict[str, list[Recipe]] = {recipe.game: [] for recipe in sorted(found, key=lambda one: one.game)}
-    for recipe in best(found).values():
-        chosen[recipe.game].append(recipe)
+def _games(found: Sequence[Recipe]) -> list[Game]:
+    judged = [(recipe.game, recipe, text) for recipe, text in verdicts.verdicts(found)]
+    chosen = {game: [recipe for own, recipe, _ in judged if own == game] for game in sorted({r.game for r in found})}
     return [
-        _game(game, candidates, [text for one, text in judged if one.game == game])
-        for game, candidates in chosen.items()
+        Game(game, headline(own) if own else None, [text for name, _, text in judged if name == game])
+        for game, own in chosen.items()
     ]
 
 
-def _game(game: str, chosen: Sequence[Recipe], sentences: list[str]) -> dict[str, Any]:
-    if not chosen:
-        text = f"Nothing was played: the collision rate is {NOT_AVAILABLE}."
-        return {"name": game, "quality": "unknown", "rate": NOT_AVAILABLE, "best": "", "n": "", "sentences": [text]}
-    first = headline(chosen)
-    whole = first.pooled
-    counts = f"{whole.collisions:,} of {whole.safe_starts:,}"
-    return {
-        "name": game, "quality": verdicts.quality(whole), "rate": percent(whole.rate),
-        "best": f"{first.name} ({first.conditions})", "n": counts, "sentences": sentences,
-    }  # fmt: skip
+class Card(NamedTuple):
+    """A heat map with its numbers, of a recipe over its seeds or of a single run."""
+
+    id: str
+    names: dict[str, str]
+    """What it is filtered by."""
+    title: str
+    runs: str
+    """What it is made of."""
+    types: Sequence[TypeCounts]
+    pooled: Pooled
+    numbers: Table
 
 
-def _cards(runs: Sequence[Run], found: Sequence[Recipe]) -> list[dict[str, Any]]:
-    """Heat maps of recipes over their seeds, safest first, then those of single runs."""
+def _cards(runs: Sequence[Run], found: Sequence[Recipe]) -> list[Card]:
+    """Recipes, safest first, then single runs."""
     ordered = sorted((one for one in found if one.types), key=lambda one: (one.game, one.pooled.rate or 0.0))
     names = {run.name: recipe.name for recipe in found for run in recipe.runs}
-    pooled = [
-        _card(f"r{k}", one, one.name, verdicts.seeds(one), one.types, one.pooled) for k, one in enumerate(ordered)
-    ]
-    single = [
-        _card(f"s{k}", run, names.get(run.name, run.operator), f"seed {run.seed}", by_type(run.table), pool(run.table))
-        for k, run in enumerate(runs)
-        if run.table
-    ]
-    return [*pooled, *single]
-
-
-def _card(
-    identifier: str, of: Run | Recipe, title: str, counted: str, types: Sequence[TypeCounts], whole: Pooled
-) -> dict[str, Any]:
-    worst = "" if whole.worst_theta is None else f", worst {verdicts.at(whole.worst_theta)}"
-    return {
-        "id": identifier, "names": names_of(of, "run" if isinstance(of, Run) else "recipe"), "title": title,
-        "quality": verdicts.quality(whole), "text": verdicts.share(whole),
-        "sub": f"{interval(whole.interval)}, {counted}{worst}", "types": types, "numbers": type_table(types),
-        "map": len(types[0].theta) == 2,
-    }  # fmt: skip
+    recipe_cards = [
+        Card(f"r{k}", names_of(one, "recipe"), one.name, verdicts.seeds(one), one.types, one.pooled,
+             type_table(one.types))
+        for k, one in enumerate(ordered)
+    ]  # fmt: skip
+    tables = [(run, by_type(run.table)) for run in runs if run.table]
+    return recipe_cards + [
+        Card(f"s{k}", names_of(run, "run"), names.get(run.name, run.operator), f"seed {run.seed}", types,
+             pool(run.table), type_table(types))
+        for k, (run, types) in enumerate(tables)
+    ]  # fmt: skip
 
 
 def _choices(runs: Sequence[Run], name: str) -> list[str]:
@@ -195,18 +163,27 @@ def _choices(runs: Sequence[Run], name: str) -> list[str]:
     return [plain(value) for value in sorted(values, key=lambda value: (value is None, value or 0))]
 
 
-def _settings(runs: Sequence[Run], found: Sequence[Recipe]) -> tuple[dict[str, str], Table | None]:
-    """Settings that all runs share, and a table of the others by recipe."""
-    keys = list(dict.fromkeys(key for run in runs for key in run.settings))
-    values = {key: {run.settings.get(key) for run in runs} for key in keys}
-    common = {key: str(next(iter(values[key]))) for key in keys if len(values[key]) == 1}
-    rest = [key for key in keys if len(values[key]) > 1 and key != "seed"]
+def _values(runs: Sequence[Run]) -> dict[str, set[str | None]]:
+    """What runs say of each setting."""
+    return {
+        key: {run.settings.get(key) for run in runs} for key in dict.fromkeys(k for run in runs for k in run.settings)
+    }
+
+
+def _common(runs: Sequence[Run]) -> dict[str, str | None]:
+    """Settings that all runs share."""
+    return {key: next(iter(values)) for key, values in _values(runs).items() if len(values) == 1}
+
+
+def _differing(runs: Sequence[Run], found: Sequence[Recipe]) -> Table | None:
+    """The other settings by recipe."""
+    keys = [key for key, values in _values(runs).items() if len(values) > 1 and key != "seed"]
+    shown = [(recipe, recipe.runs[0].settings) for recipe in found if recipe.runs]
     rows = [
-        {"game": one.game, "recipe": one.name, **{key: one.runs[0].settings.get(key) for key in rest}}
-        for one in found
-        if one.runs
+        {"game": recipe.game, "recipe": recipe.name, **{key: settings.get(key) for key in keys}}
+        for recipe, settings in shown
     ]
-    return common, mapping_table(rows) if rest and rows else None
+    return mapping_table(rows) if keys and rows else None
 
 
 def _versions(runs: Sequence[Run]) -> list[tuple[str, str]]:

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import altair as alt
-import numpy as np
 from PIL import Image
 
 from hno.data.store import replace_whole
@@ -60,10 +59,10 @@ def rollout_picture(found: Episode, path: Path, title: str) -> None:
     Args:
         found: the episode.
         path: PNG file to write.
-        title: a line above the picture.
+        title: lines above the picture.
     """
     frame = episodes.closest(found)
-    drawn = _views(found, frame, title)
+    drawn = [view(found, up, frame, follow=False, title="" if k else title) for k, up in enumerate(sides(found))]
     if episodes.distances(found) is not None:
         data = vega.inline(episodes.frames(found), "frames")
         drawn.append(separation(data, frame, episodes.reach(found)).properties(width=WIDE))
@@ -71,40 +70,14 @@ def rollout_picture(found: Episode, path: Path, title: str) -> None:
     replace_whole(path, lambda draft: picture.save(draft, format="PNG"))
 
 
-def animate(found: Episode, path: Path, title: str) -> None:
-    """Write one episode as a GIF, as fast as it happens: paths so far, and discs that overlap in a collision.
-
-    Args:
-        found: the episode.
-        path: file to write.
-        title: lines above the picture.
-    """
-    pictures = [
-        _stacked(_views(found, k, f"{title}\nt = {t:.2f} s"), scale=1).convert("P", palette=Image.Palette.ADAPTIVE)
-        for k, t in enumerate(found.t)
-    ]
-    steps = np.diff(found.t, append=2 * found.t[-1] - found.t[-2] if len(found.t) > 1 else 1)
-    first, spent = pictures[0], [max(20, round(1000 * float(step))) for step in steps]
-    replace_whole(
-        path,
-        lambda draft: first.save(
-            draft, format="GIF", save_all=True, append_images=pictures[1:], duration=spent, loop=0
-        ),
-    )
-
-
 def sides(found: Episode) -> Sequence[Literal["y", "z"]]:
     """The second axis of every view."""
     return ("y", "z") if found.positions.shape[2] == 3 else ("y",)
 
 
-def _views(found: Episode, frame: int, title: str) -> list[vega.Layers]:
-    return [view(found, up, frame, follow=False, title="" if k else title) for k, up in enumerate(sides(found))]
-
-
-def _stacked(drawn: Sequence[vega.Layers], scale: float = 2) -> Image.Image:
+def _stacked(drawn: Sequence[vega.Layers]) -> Image.Image:
     """Charts below each other."""
-    images = [Image.open(io.BytesIO(vega.png(chart, scale))).convert("RGB") for chart in drawn]
+    images = [Image.open(io.BytesIO(vega.png(chart))).convert("RGB") for chart in drawn]
     size = max(image.width for image in images), sum(image.height for image in images)
     picture, top = Image.new("RGB", size, "white"), 0
     for image in images:

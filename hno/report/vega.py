@@ -38,9 +38,9 @@ def svg(chart: alt.TopLevelMixin) -> str:
     return vl_convert.vegalite_to_svg(specification, vl_version=version())
 
 
-def png(chart: alt.TopLevelMixin, scale: float = 2) -> bytes:
+def png(chart: alt.TopLevelMixin) -> bytes:
     """The same as PNG."""
-    return vl_convert.svg_to_png(svg(chart), scale=scale)
+    return vl_convert.svg_to_png(svg(chart), scale=2)
 
 
 def inline(rows: Sequence[Mapping[str, Any]], name: str = "rows") -> alt.InlineData:

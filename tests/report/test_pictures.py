@@ -9,8 +9,7 @@ from PIL import Image
 
 from hno.report import pictures, vega
 from hno.report.episode import episode as read
-from hno.report.episode_charts import separation
-from hno.report.pictures import animate, collision_map, rollout_picture
+from hno.report.pictures import collision_map, rollout_picture
 from tests.report.tables import episode, type_row
 
 TABLE = [type_row((1, 1), 0, 200), type_row((1, 5), 10, 200, seen=False), type_row((5, 1), 0, 0)]
@@ -52,26 +51,17 @@ def test_a_map_needs_two_players_and_rows(table: list[dict[str, Any]], tmp_path:
 
 
 @pytest.mark.parametrize("dimensions", [2, 3])
-def test_an_animation_has_a_frame_for_each_time_and_they_differ(dimensions: int, tmp_path: Path) -> None:
-    animate(read(episode((1, 5), 0.3, dimensions)), tmp_path / "worst.gif", "a game")
-    with Image.open(tmp_path / "worst.gif") as image:
-        assert image.n_frames == 4
-        frames = []
-        for index in range(4):
-            image.seek(index)
-            frames.append(image.convert("RGB").tobytes())
-    assert len(set(frames)) == 4
-    assert image.info["duration"] == 500, "as fast as the episode: two frames a second"
-
-
-def test_frames_show_the_time_and_the_paths_so_far(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    seen: list[tuple[str, int]] = []
-    monkeypatch.setattr(
-        pictures, "view", lambda found, up, frame, follow, title="": seen.append((title, frame)) or view(found, frame)
-    )
-    view = lambda found, frame: separation(vega.inline([]), frame)  # noqa: E731
-    animate(read(episode((1, 5), 0.3, frames=3)), tmp_path / "worst.gif", "a game")
-    assert seen == [(f"a game\nt = {0.5 * k:.2f} s", k) for k in range(3)]
+def test_a_rollout_has_a_view_for_every_plane_and_the_distance(
+    dimensions: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept: list[str] = []
+    png = vega.png
+    monkeypatch.setattr(vega, "png", lambda chart: kept.append(vega.svg(chart)) or png(chart))
+    rollout_picture(read(episode((1, 5), 0.3, dimensions)), tmp_path / "rollout.png", "a game")
+    axes = [[text for text in ET.fromstring(found).itertext() if text.endswith(("[m]", "[s]"))] for found in kept]
+    assert axes == [["x [m]", "y [m]"], ["x [m]", "z [m]"], ["t [s]", "distance [m]"]][: dimensions - 1] + axes[-1:]
+    assert axes[-1] == ["t [s]", "distance [m]"]
+    assert "a game" in kept[0]
 
 
 def test_a_view_shows_paths_up_to_its_frame_and_discs_that_turn_red() -> None:
