@@ -28,7 +28,7 @@ from hno.evaluation.episodes import EPISODES, episodes
 from hno.evaluation.sections import Evaluation
 from hno.games import Game
 from hno.games.grid import parse_types
-from hno.training.checkpoint import OperatorPolicy, load_operator
+from hno.training.checkpoint import LearnedPolicy, load_policy
 from hno.types import Extremal
 
 log = logging.getLogger(__name__)
@@ -73,26 +73,27 @@ def checkpoints_of(config: DictConfig) -> list[str]:
 
 def _run(config: DictConfig, results: Results) -> None:
     paths = checkpoints_of(config)
-    policies = [OperatorPolicy(load_operator(path, config.expected_game)) for path in paths]
+    policies = [load_policy(path, config.expected_game) for path in paths]
     game = policies[0].game
-    results.update(**policies[0].operator.names(), seed=policies[0].operator.seed)
+    results.update(**policies[0].names(), seed=policies[0].provenance.seed)
     check_same_game(paths, [policy.game for policy in policies])
     check_evaluation(game, config)
     chosen = [types_to_evaluate(config.theta, policy, config.unseen) for policy in policies]
     types = list(dict.fromkeys(theta for own in chosen for theta in own))
-    solve = TestLabels(game, types, config, cache_folder(config.cache), config.workers)
+    settings = plain(config)
+    solve = TestLabels(game, types, settings, cache_folder(config.cache), config.workers)
     evaluations = [
-        evaluation_of(path, policy, types, config, solve) for path, policy in zip(paths, policies, strict=True)
+        evaluation_of(path, policy, types, settings, solve) for path, policy in zip(paths, policies, strict=True)
     ]
     for evaluation in evaluations:
         check_sections(evaluation)
     labels = solve_tests(solve, evaluations[0], results)
     models, played = list[dict[str, Any]](), list[Evaluation]()
-    for evaluation in evaluations:
+    for policy, evaluation in zip(policies, evaluations, strict=True):
         log.info("evaluation of %s", evaluation.name)
         found, table = (assess if models else evaluate_policy)(evaluation, labels, results)
         played.append(found)
-        names = {**evaluation.operator.names(), "seed": evaluation.operator.seed}
+        names = {**policy.names(), "seed": policy.provenance.seed}
         models.append({"checkpoint": evaluation.name, **names, "table": table})
         for name, content in run_sections(found, results):
             models[-1][name] = content
@@ -103,7 +104,7 @@ def _run(config: DictConfig, results: Results) -> None:
 
 
 def types_to_evaluate(
-    text: str, policy: OperatorPolicy, unseen: Sequence[Sequence[float]] = ()
+    text: str, policy: LearnedPolicy, unseen: Sequence[Sequence[float]] = ()
 ) -> list[tuple[float, ...]]:
     """Player types from "default", a named grid, or a list such as "1,1;2.5,4".
 
@@ -116,7 +117,7 @@ def types_to_evaluate(
     if text == "default":
         own = [theta for theta in unseen if len(theta) == game.players]
         inside = [theta for theta in own if bool(game.type_box.contains(torch.tensor(theta)))]
-        return list(dict.fromkeys([*policy.operator.seen_types, *game.validate_types(inside)]))
+        return list(dict.fromkeys([*policy.types, *game.validate_types(inside)]))
     return parse_types(game, text, also=("default",))
 
 
@@ -140,7 +141,8 @@ def evaluate_policy(evaluation: Evaluation, labels: Sequence[Extremal], results:
     write_json(folder / EPISODES, kept)
     conditions = {name: found.options[name] for name in ("clearance", "dt", "widen", "noise", "delay")}
     results.update(**conditions, constraint_unit=game.constraint_unit, table=table, episodes=EPISODES)
-    draw_typical(kept["episodes"], folder / "rollout.png", " / ".join(found.operator.names().values()))
+    title = " / ".join(str(results.content[name]) for name in ("game", "operator", "activation"))
+    draw_typical(kept["episodes"], folder / "rollout.png", title)
     return found, table
 
 
@@ -163,6 +165,6 @@ def check_evaluation(game: Game, settings: DictConfig) -> None:
         whole_number("workers", settings.workers, 1)
     for name in ("clearance", "dt"):
         finite_number(name, settings[name])
-    table_condition(game, settings)
+    table_condition(game, plain(settings))
     flag("safe", settings.safe)
     control_steps(game, settings.dt)

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-
-from omegaconf import DictConfig
+from typing import Any
 
 from hno.cli.logs import label_progress
 from hno.data.labels import Request, labels_for, safe_labels_for
@@ -34,7 +33,7 @@ class TestLabels:
         self,
         game: Game,
         types: Sequence[tuple[float, ...]],
-        settings: DictConfig,
+        settings: Mapping[str, Any],
         cache: Path,
         workers: int | None,
     ) -> None:
@@ -50,7 +49,7 @@ class TestLabels:
         return self._known[condition.starts]
 
     def _solve(self, condition: Condition) -> tuple[list[Extremal], float]:
-        chosen = self.settings
-        requests = [Request(theta, chosen.starts, chosen.seed, "test", *condition.starts) for theta in self.types]
-        solver = functools.partial(safe_labels_for, clearance=chosen.clearance) if chosen.safe else labels_for
+        starts, seed, clearance = (self.settings[name] for name in ("starts", "seed", "clearance"))
+        requests = [Request(theta, starts, seed, "test", *condition.starts) for theta in self.types]
+        solver = functools.partial(safe_labels_for, clearance=clearance) if self.settings["safe"] else labels_for
         return solver(self.game, requests, self.cache, workers=self.workers, report=label_progress())

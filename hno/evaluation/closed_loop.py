@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torchmetrics import WeightedMeanAbsolutePercentageError
 
-from hno.control.rollout import Disturbance, Policy, rollout
+from hno.control.rollout import Disturbance, Player, rollout
 from hno.data.rows import rows_of
 from hno.evaluation import format as text
 from hno.evaluation.outcome import Outcome, outcome, pooled
@@ -48,7 +48,7 @@ class TypeRow(NamedTuple):
 
 def collision_table(
     game: Game,
-    policy: Policy,
+    policy: Player,
     labels: Sequence[Extremal],
     seen: Sequence[Sequence[float]],
     clearance: float = 0.02,
@@ -72,7 +72,7 @@ def collision_table(
 
 
 def play(
-    game: Game, policy: Policy, labels: Sequence[Extremal], dt: float, disturbance: Disturbance = Disturbance()
+    game: Game, policy: Player, labels: Sequence[Extremal], dt: float, disturbance: Disturbance = Disturbance()
 ) -> list[Trajectory]:
     """Episodes from the start states of labels, one set per set of labels. See `collision_table`."""
     starts = torch.cat([found.x[:, 0] for found in labels]).float()

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import logging
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from hno.control.receding_horizon import RecedingHorizon
-from hno.control.rollout import Disturbance, Policy, rollout
+from hno.control.rollout import Disturbance, Player
 from hno.data.certificates import CLEARANCE, safe
 from hno.evaluation import format as text
 from hno.evaluation.closed_loop import play
+from hno.evaluation.latency import latency
 from hno.evaluation.outcome import Outcome, outcome, together
 from hno.evaluation.sections import Column, Evaluation, ModelSection, sections
 from hno.games import Game
@@ -52,32 +51,6 @@ class OnlineRow(NamedTuple):
         return {"theta": self.theta, **{name: getattr(self, name)._asdict() for name in self._fields[1:]}}
 
 
-class Latency(NamedTuple):
-    """Time from a state to controls of one game, on one thread; numbers that do not exist are None."""
-
-    episodes: int
-    """Episodes that were played, one at a time."""
-    answers: int
-    """Answers that were timed, without the first ones."""
-    first: float | None
-    """Median of the first answers, s."""
-    median: float | None
-    """Median of the others, s."""
-    quantile_95: float | None
-    """95 % quantile of the others, s."""
-    processor_time: float | None
-    """Median processor time of the others, s: well below `median` on a machine that is busy with other work."""
-
-    @property
-    def rate(self) -> float | None:
-        """Answers per second, from the median, Hz."""
-        return 1 / self.median if self.median else None
-
-    def content(self) -> dict[str, Any]:
-        """JSON content."""
-        return self._asdict() | {"rate": self.rate}
-
-
 def safe_starts(labels: Sequence[Extremal], count: int, clearance: float) -> list[Extremal]:
     """The first safe starts of every label set; fewer where there are no more."""
     return [part(found, safe(found, clearance).nonzero().squeeze(-1)[:count]) for found in labels]
@@ -85,7 +58,7 @@ def safe_starts(labels: Sequence[Extremal], count: int, clearance: float) -> lis
 
 def compare(
     game: Game,
-    policy: Policy,
+    policy: Player,
     labels: Sequence[Extremal],
     types: Sequence[Sequence[float]],
     interval: int = 1,
@@ -131,68 +104,6 @@ def _row(
     learned, online = (outcome(game, labels, episodes, clearance) for episodes in played)
     counts = (int(count[rows].sum()) for count in (solver.solves, solver.searches, solver.failures))
     return OnlineRow(theta, learned, online, SolverCounts(*counts))
-
-
-def latency(
-    game: Game,
-    make_policy: Callable[[], Policy],
-    labels: Sequence[Extremal],
-    every: int = 1,
-    dt: float = 0.02,
-    episodes: int = 5,
-) -> Latency:
-    """Time a policy on some episodes, one after the other and without disturbance, on one thread.
-
-    Args:
-        game: the game.
-        make_policy: the policy for one episode.
-        labels: where the starts come from, at least one row in all.
-        every: answers of which one counts, beginning with the first: the interval of a receding-horizon controller.
-        dt: time for which a control is held, s.
-        episodes: how many starts are played, spread over all label sets.
-    """
-    starts = torch.cat([found.x[:, 0] for found in labels]).float()
-    theta = torch.cat([found.theta for found in labels]).float()
-    chosen = torch.linspace(0, len(starts) - 1, min(episodes, len(starts))).round().long()
-    first, later, processor = list[float](), list[float](), list[float]()
-    with one_thread():
-        for row in chosen:
-            timed = _Timed(make_policy())
-            rollout(game, timed, starts[row : row + 1], theta[row : row + 1], dt)
-            first.append(timed.seconds[0])
-            later += timed.seconds[every::every]
-            processor += timed.processor[every::every]
-    numbers = (_quantile(part, share) for part, share in ((first, 0.5), (later, 0.5), (later, 0.95), (processor, 0.5)))
-    return Latency(len(chosen), len(later), *numbers)
-
-
-def _quantile(seconds: Sequence[float], share: float) -> float | None:
-    return float(torch.tensor(seconds).quantile(share)) if seconds else None
-
-
-class _Timed:
-    """A policy that records how long its answers take, on the clock and on the processor."""
-
-    def __init__(self, policy: Policy) -> None:
-        self.policy, self.seconds, self.processor = policy, list[float](), list[float]()
-
-    def __call__(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
-        began, worked = time.perf_counter(), time.process_time()
-        u = self.policy(tau, x, theta)
-        self.seconds.append(time.perf_counter() - began)
-        self.processor.append(time.process_time() - worked)
-        return u
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Let torch use one thread for a while."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 CONTROLLERS = {"policy": "learned", "solver": "solved online"}

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from hno.control.rollout import Policy
+from hno.control.rollout import Player
 from hno.data.labels import interchangeable
 from hno.evaluation import format as text
 from hno.evaluation.closed_loop import play
@@ -40,7 +40,7 @@ LabelsOf = Callable[[Condition], Sequence[Extremal]]
 
 
 def robustness_table(
-    game: Game, policy: Policy, conditions: Sequence[Condition], labels_of: LabelsOf, clearance: float, dt: float
+    game: Game, policy: Player, conditions: Sequence[Condition], labels_of: LabelsOf, clearance: float, dt: float
 ) -> list[ConditionRow]:
     """Play from the starts of labels under every condition.
 
@@ -56,7 +56,7 @@ def robustness_table(
 
 
 def _row(
-    game: Game, policy: Policy, condition: Condition, labels: Sequence[Extremal], clearance: float, dt: float
+    game: Game, policy: Player, condition: Condition, labels: Sequence[Extremal], clearance: float, dt: float
 ) -> ConditionRow:
     played = play(game, policy, labels, dt, condition.disturbance)
     by_type = [outcome(game, *sets, clearance) for sets in zip(labels, played, strict=True)]

@@ -10,7 +10,7 @@ import abc
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple
 
-from hno.control.rollout import Policy
+from hno.control.rollout import Player
 from hno.evaluation.conditions import Condition
 from hno.evaluation.format import NOT_AVAILABLE
 from hno.games import Game
@@ -51,7 +51,7 @@ class Evaluation(NamedTuple):
     """Path of its checkpoint."""
     operator: ValueOperator
     """Its value function."""
-    policy: Policy
+    policy: Player
     """Its feedback controls of all players."""
     seen: Sequence[tuple[float, ...]]
     """Types that it was trained with."""

@@ -17,9 +17,8 @@ from hno.evaluation import closed_loop
 from hno.evaluation.residuals import REGIONS
 from hno.games import Game, make
 from hno.games.base import ExtrapolationWarning
-from hno.operators import operators
 from hno.types import Trajectory
-from tests.cli.conftest import SMOKE, Command, refused
+from tests.cli.conftest import SMOKE, Command, refused, save_random
 
 FAST = ("workers=1", "starts=4", "dt=0.1")
 
@@ -153,15 +152,8 @@ def test_without_a_safe_start_every_section_says_so(command: Command, random_che
 
 def other(checkpoint: Path, folder: Path, game: str = "narrow_road", seed: int = 1, **constants: float) -> Path:
     """Another operator with random weights."""
-    torch.manual_seed(seed)
-    operator = operators.get("sno")(make(game, **constants), width=16, depth=2)
-    operator.seen_types = [(1.0, 1.0), (5.0, 5.0)]
-    content: dict[str, object] = {"state_dict": operator.state_dict()}
-    operator.on_save_checkpoint(content)
     path = checkpoint.parent.parent / folder / "last.ckpt"
-    path.parent.mkdir()
-    torch.save(content, path)
-    return path
+    return save_random(path, make(game, **constants), "sno", seed, also=5.0)
 
 
 def test_results_hold_the_configuration(command: Command, random_checkpoint: Path) -> None:

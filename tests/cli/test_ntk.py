@@ -7,14 +7,14 @@ import pytest
 import torch
 
 from hno.evaluation.conditions import Condition
-from hno.evaluation.ntk import TangentKernel
+from hno.evaluation.kernels import TangentKernel
 from hno.evaluation.sections import Evaluation
 from hno.evaluation.spectrum import spectrum, summary
 from hno.games import make
-from hno.operators import operators
+from hno.operators import make_operator
 from hno.types import Status
 from tests.cli.conftest import SMOKE, Command, refused
-from tests.fakes import fake_labels
+from tests.fakes import fake_labels, small_architecture
 
 FAST = ("workers=1", "starts=4", "dt=0.1")
 
@@ -81,7 +81,7 @@ def test_impossible_settings(command: Command, random_checkpoint: Path, override
 
 def test_a_type_without_labels_says_why() -> None:
     torch.manual_seed(0)
-    operator = operators.get("sno")(make("narrow_road"), width=8, depth=1)
+    operator = make_operator(make("narrow_road"), small_architecture(width=8, depth=1))
     failed = fake_labels(operator.game, (1.0, 1.0), status=[Status.STALLED] * 4)
     labels = [failed, fake_labels(operator.game, (1.0, 5.0)), fake_labels(operator.game, (3.0, 3.0))]
     seen, types = [(1.0, 1.0), (1.0, 5.0)], [(1.0, 1.0), (1.0, 5.0), (3.0, 3.0)]

@@ -14,11 +14,11 @@ from torch import Tensor
 
 from hno.evaluation.residuals import REGIONS, ResidualRow, Residuals, hji, residual_table
 from hno.games import Game, make
-from hno.losses import Scales
+from hno.losses import Scales, View
 from hno.losses.hji import HJIResidual
-from hno.operators import ValueOperator, operators
+from hno.operators import ValueOperator, make_operator
 from hno.types import Field, Points, Sample, Status
-from tests.fakes import fake_labels
+from tests.fakes import fake_labels, small_architecture
 from tests.lq import LinearQuadratic
 
 AB, RQS = (0.4, 1.3), (0.7, 1.1, 0.9)
@@ -42,8 +42,8 @@ def riccati(error: Callable[[Tensor], tuple[Tensor, Tensor]]) -> ValueOperator:
         rate = q + 2 * a * p - b**2 * p**2 / r
         return Field(-p * x**2 + more, -rate * x**2 + slope, (-2 * p * x)[..., None, None])
 
-    scales = {"value_scale": torch.tensor(2.0), "costate_scale": torch.ones(1, 1, 1)}
-    fake: Any = SimpleNamespace(game=one_player(), field=field, **scales)
+    scales = Scales(torch.tensor(2.0), torch.ones(1, 1, 1))
+    fake: Any = SimpleNamespace(game=one_player(), field=field, scales=scales)
     return fake
 
 
@@ -81,7 +81,7 @@ def test_bins_are_of_time_to_go() -> None:
 @pytest.fixture
 def operator() -> ValueOperator:
     torch.manual_seed(0)
-    built = operators.get("hno")(make("narrow_road"), width=16, depth=2).eval().requires_grad_(False)
+    built = make_operator(make("narrow_road"), small_architecture()).eval().requires_grad_(False)
     built.set_scales(Scales(torch.tensor(20.0), torch.ones(2, 2, 4)))
     return built
 
@@ -95,9 +95,8 @@ def test_means_are_those_of_the_loss_term(operator: ValueOperator) -> None:
         found.x.flatten(0, 1).float(),
         torch.tensor([[2.0, 3.0]] * 5 * nodes),
     )
-    term = HJIResidual()
-    residual = term.residual(game, Sample(points), operator.field(points))
-    scale = term.scale(game, Sample(points), Scales(operator.value_scale, operator.costate_scale))
+    view = View(game, Sample(points), operator.field(points), operator.field, operator.scales, 0)
+    residual, scale = HJIResidual().residual(view), HJIResidual().scale(view)
     assert row.points == 5 * nodes
     assert row.physical == pytest.approx(residual.abs().mean().item(), rel=1e-5)
     assert row.scaled == pytest.approx((residual / scale).abs().mean().item(), rel=1e-5)
