@@ -18,19 +18,19 @@ from hno.cli.arguments import Arguments
 from hno.cli.checkpoints import trained
 from hno.cli.config import read
 from hno.cli.logs import send_lightning_to_hydra, use_threads
+from hno.cli.media import draw_typical
 from hno.cli.results import Results, config_hash, plain, write_json
 from hno.cli.schema import Episodes, EvaluateSettings
 from hno.cli.sections import check_sections, evaluation_of, run_sections, table_condition
 from hno.cli.starts import TestLabels, cache_folder
 from hno.cli.summary import report, show
-from hno.control.rollout import control_steps, rollout
+from hno.control.rollout import control_steps
 from hno.evaluation.closed_loop import CollisionTable, play
 from hno.evaluation.comparison import PairedComparison, check_same_game
 from hno.evaluation.episodes import EPISODES, episodes
 from hno.evaluation.sections import Evaluation
 from hno.games import Game
 from hno.games.grid import parse_types
-from hno.report.picture import PlotsMissingError, rollout_picture, typical
 from hno.training.checkpoint import LearnedPolicy, load_policy
 from hno.types import Extremal
 
@@ -183,11 +183,12 @@ def evaluate_policy(evaluation: Evaluation, labels: Sequence[Extremal], results:
     """Play from the starts of the labels, put the table into the results, keep some episodes and draw one."""
     found, table = assess(evaluation, labels, results)
     folder, game = results.path.parent, found.game
-    write_json(folder / EPISODES, episodes(game, found.played, labels, found.clearance))
+    kept = episodes(game, found.played, labels, found.clearance)
+    write_json(folder / EPISODES, kept)
     conditions = {name: found.options[name] for name in ("clearance", "dt", "widen", "noise", "delay")}
     results.update(**conditions, constraint_unit=game.constraint_unit, table=table, episodes=EPISODES)
     title = " / ".join(str(results.content[name]) for name in ("game", "operator", "activation"))
-    draw(found, folder / "rollout.png", title)
+    draw_typical(kept["episodes"], folder / "rollout.png", title)
     return found, table
 
 
@@ -200,17 +201,6 @@ def assess(evaluation: Evaluation, labels: Sequence[Extremal], results: Results)
     table = CollisionTable().compute(found)
     results.time("evaluation", time.perf_counter() - began)
     return found, table
-
-
-def draw(evaluation: Evaluation, path: Path, title: str, episodes: int = 15) -> None:
-    """Draw a typical episode from the first starts of the first type; without matplotlib, say so."""
-    labels, game = evaluation.labels[0], evaluation.game
-    starts, theta = labels.x[:episodes, 0].float(), labels.theta[:episodes].float()
-    played = rollout(game, evaluation.policy, starts, theta, evaluation.dt)
-    try:
-        rollout_picture(game, played, theta, path, title, typical(played))
-    except PlotsMissingError as error:
-        log.info("No picture: %s", error)
 
 
 def check_evaluation(game: Game, settings: Episodes) -> None:

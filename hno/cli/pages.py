@@ -9,8 +9,7 @@ from pathlib import Path
 
 from hno.cli.arguments import Arguments
 from hno.cli.config import configured
-from hno.cli.schema import ReportSettings, SettingsError
-from hno.report.runs import NoRunsError, load
+from hno.cli.schema import ReportSettings
 
 PAGE = "report.html"
 
@@ -24,6 +23,7 @@ def write(folder: Path) -> str:
     again = f"hno report {shlex.quote(str(folder))}"
     try:
         from hno.report.page import write_page
+        from hno.report.runs import load
 
         write_page(load(folder), folder / PAGE)
     except ModuleNotFoundError as error:
@@ -34,7 +34,7 @@ def write(folder: Path) -> str:
 
 
 def _needs(error: ModuleNotFoundError) -> str:
-    return f"needs the package {error.name}: pip install altair jinja2 vl-convert-python"
+    return f"needs the package {error.name}: pip install altair jinja2 pillow vl-convert-python"
 
 
 def run(given: Arguments) -> int:
@@ -46,13 +46,15 @@ def run(given: Arguments) -> int:
     except ModuleNotFoundError as error:
         print(f"A report {_needs(error)}", file=sys.stderr)
         return 1
-    except (NoRunsError, OSError, SettingsError) as error:
+    except (ValueError, OSError) as error:  # no runs, or settings that make no sense
         print(error, file=sys.stderr)
         return 1
     return 0
 
 
 def _report(settings: ReportSettings) -> None:
+    from hno.report.runs import load
+
     folder = Path(settings.folder)
     if settings.figures:
         from hno.report.figures import write_figures

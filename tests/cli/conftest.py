@@ -77,7 +77,7 @@ def command(
     no_pages: None,
 ) -> Command:
     """Run a command in this process, as the command line would, but without pictures and pages."""
-    monkeypatch.setattr(evaluate, "draw", lambda *arguments: None)
+    monkeypatch.setattr(evaluate, "draw_typical", lambda *arguments: None)
 
     def run(name: str, *words: str, folder: Path = tmp_path / "run") -> Outcome:
         monkeypatch.setattr(sys, "argv", [name])

@@ -5,7 +5,6 @@ from typing import Any
 
 import pytest
 import torch
-from hno.data.sampling import SOURCES, onto_band
 from torch import Tensor
 
 from hno.data.curriculum import Curriculum

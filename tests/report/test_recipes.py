@@ -12,26 +12,25 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import beta, t
 
-from hno.report.aggregate import Rate, Recipe, best, excess, headline, pool, rivals, spread, worst
-from hno.report.grouping import recipes
-from hno.report.parsing import TypeResult, type_result
-from hno.report.payload import heat_map
-from hno.report.runs import Run, load
+from hno.evaluation.closed_loop import TypeRow
+from hno.report.page_data import cells
+from hno.report.recipes import Recipe, best, by_type, headline, pool, recipes, rivals, spread
+from hno.report.records import Run, type_row
+from hno.report.runs import load
 from hno.report.tables import recipe_table
-from hno.report.words import worst_type
 from tests.report.folders import make_results, row, write_run
 
 FIRST, SECOND = (1.0, 1.0), (5.0, 5.0)
 
 
-def result(theta: tuple[float, ...], collisions: int, starts: int, excess_cost: float | None = None) -> TypeResult:
-    return TypeResult(theta, False, collisions, starts, None, excess_cost, 10.0)
+def result(theta: tuple[float, ...], collisions: int, starts: int, excess_cost: float | None = None) -> TypeRow:
+    return type_row(row(theta, collisions, starts) | {"median_excess_cost": excess_cost, "median_label_cost": 10.0})
 
 
 def write(folder: Path, seed: int, collisions: Sequence[int], **entries: Any) -> None:
     names = {"game": "drone", "operator": "sno", "activation": "tanh"} | entries
     table = [row(theta, count, 100) for theta, count in zip((FIRST, SECOND), collisions, strict=True)]
-    results = {"schema": 2, "status": "finished", "reason": None, "seed": seed, "seconds": {"labels": 1.0 + seed}}
+    results = {"status": "finished", "reason": None, "seed": seed, "seconds": {"labels": 1.0 + seed}}
     results |= {"config": {"operator": names["operator"], "seed": seed}, "table": table, "episodes": None} | names
     write_run(folder, results, extras=False)
 
@@ -43,7 +42,7 @@ def loaded(folder: Path) -> tuple[Run, ...]:
 @given(starts=st.integers(1, 400), share=st.floats(0, 1))
 def test_the_interval_is_clopper_pearson(starts, share):
     hits = round(share * starts)
-    low, high = Rate(hits, starts).interval
+    ((*_, (low, high), _),) = by_type([result(FIRST, hits, starts)])
     assert low == pytest.approx(beta.ppf(0.025, hits, starts - hits + 1) if hits else 0.0)
     assert high == pytest.approx(beta.ppf(0.975, hits + 1, starts - hits) if hits < starts else 1.0)
 
@@ -62,39 +61,53 @@ def test_the_spread_is_students(values):
 def test_nothing_is_not_zero():
     assert spread([None, None]) is None
     assert spread([None, 3.0]) == (3.0, None, 3.0, 3.0, 1)
-    assert Rate(0, 0).value is None
-    assert Rate(0, 0).interval is None
-    assert excess([result(FIRST, 0, 0)]) is None
-    assert worst([result(FIRST, 0, 0)]) is None
+    (counts,) = by_type([result(FIRST, 0, 0)])
+    assert (counts.rate, counts.interval, counts.relative_excess) == (None, None, None)
 
 
 def test_types_outside_the_box_stay_marked_over_seeds_and_on_the_page():
-    (inside, outside) = (type_result(row(FIRST, 1) | {"extrapolated": flag}) for flag in (False, True))
-    assert [entry[-1] for entry in heat_map([inside, pool([outside, outside])])] == [0, 1]
+    inside, outside = (
+        type_row(row(theta, 1) | {"extrapolated": flag}) for theta, flag in ((FIRST, False), (SECOND, True))
+    )
+    assert [cell["extrapolated"] for cell in cells(by_type([inside, outside, outside]))] == [False, True]
 
 
-def test_where_nothing_collided_no_type_is_the_worst():
-    assert worst_type(worst([result(FIRST, 0, 0)])) == "n/a"
-    assert worst_type(worst([result(FIRST, 0, 9), result(SECOND, 0, 9)])) == "none"
-    assert worst_type(worst([result(FIRST, 0, 9), result(SECOND, 1, 10)])) == "(5, 5) 10.00 %"
+@pytest.mark.parametrize(
+    ("counts", "shown"), [([(0, 0)], "n/a"), ([(0, 9), (0, 9)], "none"), ([(0, 9), (1, 10)], "(5, 5) 10.00 %")]
+)
+def test_where_nothing_collided_no_type_is_the_worst(tmp_path, counts, shown):
+    table = [row(theta, *found) for theta, found in zip((FIRST, SECOND), counts, strict=False)]
+    write(tmp_path / "0", 0, (0, 0), table=table)
+    assert cell(tmp_path, "worst type") == shown
 
 
 def test_counts_are_pooled_and_other_numbers_averaged():
-    pooled = pool([result(FIRST, 1, 100, 2.0), result(FIRST, 4, 50, None), result(FIRST, 0, 50, 4.0)])
-    assert (pooled.collisions, pooled.starts, pooled.excess) == (5, 200, 3.0)
+    (pooled,) = by_type([result(FIRST, 1, 100, 2.0), result(FIRST, 4, 50, None), result(FIRST, 0, 50, 4.0)])
+    assert (pooled.collisions, pooled.safe_starts, pooled.relative_excess) == (5, 200, pytest.approx(0.3))
 
 
 def test_the_excess_of_a_run_is_the_median_over_types():
-    rows = [result(FIRST, 0, 9, cost) for cost in (1.0, 2.0, 7.0)]
-    assert excess(rows) == pytest.approx(0.2)
+    rows = [result((k, k), 0, 9, cost) for k, cost in enumerate((1.0, 2.0, 7.0))]
+    assert pool(rows).relative_excess == pytest.approx(0.2)
+
+
+def rate(recipe: Recipe) -> tuple[int, int]:
+    return recipe.pooled.collisions, recipe.pooled.safe_starts
+
+
+def cell(folder: Path, heading: str) -> str:
+    """Of the one line of the table of recipes."""
+    table = recipe_table(recipes(loaded(folder)))
+    (texts,) = table.texts
+    return texts[[column.title for column in table.columns].index(heading)]
 
 
 def test_seeds_of_one_recipe_are_one_line(tmp_path):
     write(tmp_path / "0", 0, (0, 1))
     write(tmp_path / "1", 1, (2, 5))
     (recipe,) = recipes(loaded(tmp_path))
-    assert recipe.rate == (8, 400)
-    assert [(entry.theta, entry.collisions, entry.starts) for entry in recipe.table] == [
+    assert rate(recipe) == (8, 400)
+    assert [(entry.theta, entry.collisions, entry.safe_starts) for entry in recipe.types] == [
         (FIRST, 2, 200),
         (SECOND, 6, 200),
     ]
@@ -107,8 +120,7 @@ def test_seeds_of_one_recipe_are_one_line(tmp_path):
 def test_labels_from_the_cache_are_said_to_be(tmp_path, seeds, shown):
     for seed in seeds:
         write(tmp_path / str(seed), seed, (0, 1), seconds={"labels": 10.0 * seed, "training": 50.0})
-    table = recipe_table(recipes(loaded(tmp_path)))
-    assert table.rows[0].cells[table.columns.index("labels s")].text == shown
+    assert cell(tmp_path, "labels, s") == shown
 
 
 def test_another_setting_is_another_recipe_and_says_which(tmp_path):
@@ -121,7 +133,7 @@ def test_the_same_seed_counts_once(tmp_path):
     write(tmp_path / "0", 0, (50, 50))
     write(tmp_path / "1", 0, (1, 1))
     (recipe,) = recipes(loaded(tmp_path))
-    assert recipe.rate == (2, 200)
+    assert rate(recipe) == (2, 200)
     assert [run.name for run in recipe.repeated] == ["0"]
 
 
@@ -130,7 +142,7 @@ def test_failed_and_unfinished_runs_are_told_but_not_counted(tmp_path):
     write(tmp_path / "1", 1, (90, 90), status="failed", reason="diverged")
     write(tmp_path / "2", 2, (90, 90), status="running")
     (recipe,) = recipes(loaded(tmp_path))
-    assert (recipe.rate, recipe.failed, recipe.unfinished) == ((1, 200), 1, 1)
+    assert (rate(recipe), recipe.failed, recipe.unfinished) == ((1, 200), 1, 1)
 
 
 def recipe_names(found: Sequence[Recipe]) -> list[str]:
@@ -155,7 +167,7 @@ def test_other_conditions_of_play_are_not_compared(tmp_path):
     write(tmp_path / "4", 0, (0, 0), operator="easy", config=config)
     found = recipes(loaded(tmp_path))
     assert len(best(found)) == 5
-    assert headline(best(found).values()).rate == (10, 200)
+    assert rate(headline(best(found).values())) == (10, 200)
     assert any("radius 0.1" in recipe.conditions for recipe in found)
     assert all(rivals(chosen, found) == [] for chosen in best(found).values())
 
