@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import difflib
 import importlib
+import inspect
 import pkgutil
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from importlib.metadata import entry_points
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 T = TypeVar("T")
 
@@ -99,3 +100,35 @@ def unknown_name(kind: str, name: str, known: list[str]) -> str:
     near = difflib.get_close_matches(name, known, n=1)
     hint = f" Did you mean {near[0]!r}?" if near else ""
     return f"No {kind} named {name!r}. Known: {', '.join(known)}.{hint}"
+
+
+def options_of(factory: Callable[..., Any], *, skip: Collection[str] = ()) -> dict[str, Any]:
+    """Options of a class or function and their defaults; `inspect.Parameter.empty` for those without one.
+
+    Args:
+        factory: the class or function.
+        skip: parameters that are no options.
+    """
+    kinds = inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD
+    parameters = inspect.signature(factory).parameters.values()
+    return {p.name: p.default for p in parameters if p.kind not in kinds and p.name not in skip}
+
+
+def check_options(
+    what: str, factory: Callable[..., Any], given: Collection[str], *, skip: Collection[str] = ()
+) -> None:
+    """Refuse options that a class or function does not know.
+
+    Args:
+        what: it, in words.
+        factory: the class or function.
+        given: names of options.
+        skip: parameters that are no options.
+
+    Raises:
+        UnknownNameError: one of them is unknown; the message lists the known ones and the nearest.
+    """
+    known = sorted(options_of(factory, skip=skip))
+    for name in given:
+        if name not in known:
+            raise UnknownNameError(unknown_name(f"option of {what}", name, known or ["none"]))

@@ -22,12 +22,12 @@ from hno.cli import pages
 from hno.cli.results import Results
 from hno.cli.sweep import Job, show_jobs
 from hno.games import games
-from hno.operators import activations, operators
+from hno.operators import activations, networks
 from hno.registry import Registry, unknown_name
 
 log = logging.getLogger(__name__)
 
-PLUGGABLE: dict[str, Registry[Any]] = {"game": games, "operator": operators, "activation": activations}
+PLUGGABLE: dict[str, Registry[Any]] = {"game": games, "network": networks, "activation": activations}
 """Groups whose choices are registered classes."""
 
 
@@ -46,7 +46,6 @@ def register_plugins() -> None:
         for name in registry.names():
             if not (config_dir() / group / f"{name}.yaml").exists():
                 node: dict[str, Any] = {"game": {"name": name, "constants": {}}} if group == "game" else {"name": name}
-                node |= {"members": 1} if group == "operator" else {}
                 package = "_global_" if group == "game" else None
                 ConfigStore.instance().store(group=group, name=name, node=node, package=package)
 

@@ -28,7 +28,7 @@ from hno.evaluation.episodes import EPISODES, episodes
 from hno.games import Game
 from hno.games.grid import parse_types
 from hno.report.picture import PlotsMissingError, rollout_picture, typical
-from hno.training.checkpoint import OperatorPolicy, load_operator
+from hno.training.checkpoint import LearnedPolicy, load_policy
 from hno.types import Extremal, Trajectory
 
 log = logging.getLogger(__name__)
@@ -73,9 +73,9 @@ def checkpoints_of(config: DictConfig) -> list[str]:
 
 def _run(config: DictConfig, results: Results) -> None:
     paths = checkpoints_of(config)
-    policies = [OperatorPolicy(load_operator(path, config.expected_game)) for path in paths]
+    policies = [load_policy(path, config.expected_game) for path in paths]
     game = policies[0].game
-    results.update(**policies[0].operator.names(), seed=policies[0].operator.seed)
+    results.update(**policies[0].names(), seed=policies[0].provenance.seed)
     check_same_game(paths, [policy.game for policy in policies])
     check_evaluation(game, config)
     chosen = [types_to_evaluate(config.theta, policy, config.unseen) for policy in policies]
@@ -89,7 +89,7 @@ def _run(config: DictConfig, results: Results) -> None:
         found = assess(policy, labels, config, results) if models else evaluate_policy(policy, labels, config, results)
         outcomes.append(found.collided)
         table = [row._asdict() for row in found.table]
-        names = {**policy.operator.names(), "seed": policy.operator.seed}
+        names = {**policy.names(), "seed": policy.provenance.seed}
         models.append({"checkpoint": path, **names, "table": table})
         for name, content in run_sections(policy, labels, config, results):
             models[-1][name] = content
@@ -100,7 +100,7 @@ def _run(config: DictConfig, results: Results) -> None:
 
 
 def types_to_evaluate(
-    text: str, policy: OperatorPolicy, unseen: Sequence[Sequence[float]] = ()
+    text: str, policy: LearnedPolicy, unseen: Sequence[Sequence[float]] = ()
 ) -> list[tuple[float, ...]]:
     """Player types from "default", a named grid, or a list such as "1,1;2.5,4".
 
@@ -113,7 +113,7 @@ def types_to_evaluate(
     if text == "default":
         own = [theta for theta in unseen if len(theta) == game.players]
         inside = [theta for theta in own if bool(game.type_box.contains(torch.tensor(theta)))]
-        return list(dict.fromkeys([*policy.operator.seen_types, *game.validate_types(inside)]))
+        return list(dict.fromkeys([*policy.types, *game.validate_types(inside)]))
     return parse_types(game, text, also=("default",))
 
 
@@ -144,7 +144,7 @@ class Outcome(NamedTuple):
 
 
 def evaluate_policy(
-    policy: OperatorPolicy, labels: Sequence[Extremal], settings: DictConfig, results: Results
+    policy: LearnedPolicy, labels: Sequence[Extremal], settings: DictConfig, results: Results
 ) -> Outcome:
     """Roll out from the starts of the labels, put the table into the results, keep some episodes and draw one."""
     found = assess(policy, labels, settings, results)
@@ -155,13 +155,12 @@ def evaluate_policy(
     return found
 
 
-def assess(policy: OperatorPolicy, labels: Sequence[Extremal], settings: DictConfig, results: Results) -> Outcome:
+def assess(policy: LearnedPolicy, labels: Sequence[Extremal], settings: DictConfig, results: Results) -> Outcome:
     """Roll out from the starts of the labels."""
     began = time.perf_counter()
     disturbance = Disturbance(settings.noise, settings.delay, settings.seed)
     played = play(policy.game, policy, labels, settings.dt, disturbance)
-    operator = policy.operator
-    table = tabulate(policy.game, labels, played, operator.seen_types, settings.clearance, operator.field)
+    table = tabulate(policy.game, labels, played, policy.types, settings.clearance, policy.operator.field)
     safe = [classify(found, settings.clearance)[0] for found in labels]
     results.time("evaluation", time.perf_counter() - began)
     return Outcome(table, played, [collided(part)[mask] for part, mask in zip(played, safe, strict=True)])
@@ -180,11 +179,11 @@ def comparison(
     return {"reference": paths[0], "models": rows}
 
 
-def draw(policy: OperatorPolicy, found: Extremal, path: Path, dt: float, episodes: int = 15) -> None:
+def draw(policy: LearnedPolicy, found: Extremal, path: Path, dt: float, episodes: int = 15) -> None:
     """Draw a typical episode from the first starts of a label set; without matplotlib, say so."""
     starts, theta = found.x[:episodes, 0].float(), found.theta[:episodes].float()
     played = rollout(policy.game, policy, starts, theta, dt)
-    names = policy.operator.names()
+    names = policy.names()
     try:
         rollout_picture(policy.game, played, theta, path, " / ".join(names.values()), typical(played))
     except PlotsMissingError as error:

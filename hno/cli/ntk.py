@@ -13,7 +13,7 @@ from hno.data.rows import NoLabelsError
 from hno.evaluation.ntk import rows_per_point, type_kernel
 from hno.evaluation.spectrum import Summary, summary
 from hno.operators import ValueOperator
-from hno.operators.deeponet import nets
+from hno.training.checkpoint import LearnedPolicy
 from hno.types import Extremal
 
 COLUMNS = ("theta", "points", "kernel", "condition", "rank", "effective rank", "largest eigenvalue")
@@ -21,26 +21,26 @@ KINDS = {"kernel": "J J'", "product": "paper's product"}
 """What a section has of each type, and how it is called."""
 
 
-def check_ntk(operator: ValueOperator, types: Iterable[tuple[float, ...]], settings: DictConfig) -> None:
+def check_ntk(policy: LearnedPolicy, types: Iterable[tuple[float, ...]], settings: DictConfig) -> None:
     """Raise ValueError for entries from which no kernel can be made."""
-    check_rows(operator, settings)
-    if not set(types) & set(operator.seen_types):
-        seen = "; ".join(",".join(f"{t:g}" for t in theta) for theta in operator.seen_types) or "none"
+    check_rows(policy.operator, settings)
+    if not set(types) & set(policy.types):
+        seen = "; ".join(",".join(f"{t:g}" for t in theta) for theta in policy.types) or "none"
         raise ValueError(f'ntk=true needs a type of the training run among theta; these are "{seen}".')
 
 
 def check_rows(operator: ValueOperator, settings: DictConfig) -> None:
     """Raise ValueError unless the operator is one net and its kernel has rows for at least one point."""
-    members = len(nets(operator.net))
+    members = len(operator.members)
     if members > 1:
         raise ValueError(f"ntk=true is for one net, this operator has {members}. Train it with operator.members=1.")
     whole_number("ntk_rows", settings.ntk_rows, rows_per_point(operator), "the rows of one point")
 
 
-def ntk_section(operator: ValueOperator, labels: Sequence[Extremal], settings: DictConfig) -> list[dict[str, Any]]:
+def ntk_section(policy: LearnedPolicy, labels: Sequence[Extremal], settings: DictConfig) -> list[dict[str, Any]]:
     """One entry for every set of labels whose type the operator was trained on."""
-    seen = [found for found in labels if tuple(found.theta[0].tolist()) in operator.seen_types]
-    return [_entry(operator, found, settings) for found in seen]
+    seen = [found for found in labels if tuple(found.theta[0].tolist()) in policy.types]
+    return [_entry(policy.operator, found, settings) for found in seen]
 
 
 def _entry(operator: ValueOperator, found: Extremal, settings: DictConfig) -> dict[str, Any]:

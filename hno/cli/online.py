@@ -16,7 +16,7 @@ from hno.control.receding_horizon import RecedingHorizon
 from hno.control.rollout import Disturbance
 from hno.evaluation.yardstick import compare, latency, safe_starts
 from hno.report.words import interval, number, percent
-from hno.training.checkpoint import OperatorPolicy
+from hno.training.checkpoint import LearnedPolicy
 from hno.types import Extremal
 
 log = logging.getLogger(__name__)
@@ -25,7 +25,7 @@ COLUMNS = ("theta", "controller", "starts", "collisions", "rate", "95 % interval
 NAMES = {"policy": "learned", "solver": "solved online"}
 
 
-def online_section(policy: OperatorPolicy, labels: Sequence[Extremal], settings: DictConfig) -> dict[str, Any]:
+def online_section(policy: LearnedPolicy, labels: Sequence[Extremal], settings: DictConfig) -> dict[str, Any]:
     """Drive `settings.online` safe starts per type with both controllers; JSON content."""
     thetas = [tuple(map(float, found.theta[0])) for found in labels]
     chosen = safe_starts(labels, settings.online, settings.clearance)

@@ -20,7 +20,7 @@ from hno.control.rollout import Disturbance
 from hno.evaluation.residuals import residual_table
 from hno.evaluation.robustness import Condition, read_conditions, robustness_table
 from hno.games import Game
-from hno.training.checkpoint import OperatorPolicy
+from hno.training.checkpoint import LearnedPolicy
 from hno.types import Extremal
 
 Types = Sequence[tuple[float, ...]]
@@ -29,20 +29,20 @@ Types = Sequence[tuple[float, ...]]
 class Section(NamedTuple):
     """A part of an evaluation, switched on by the configuration entry of its name."""
 
-    compute: Callable[[OperatorPolicy, Sequence[Extremal], DictConfig], Any]
+    compute: Callable[[LearnedPolicy, Sequence[Extremal], DictConfig], Any]
     """(policy, labels of every type, configuration) -> content of results.json."""
     show: Callable[[Any, Console], None]
     """Prints that content."""
-    check: Callable[[OperatorPolicy, Types, DictConfig], object] = lambda policy, types, settings: None
+    check: Callable[[LearnedPolicy, Types, DictConfig], object] = lambda policy, types, settings: None
     """Raises ValueError for entries that make no sense, before anything expensive."""
 
 
-def residuals(policy: OperatorPolicy, labels: Sequence[Extremal], settings: DictConfig) -> list[dict[str, Any]]:
+def residuals(policy: LearnedPolicy, labels: Sequence[Extremal], settings: DictConfig) -> list[dict[str, Any]]:
     """The HJI residual by type, region and time to go."""
-    return [row._asdict() for row in residual_table(policy.operator, labels, seed=settings.seed)]
+    return [row._asdict() for row in residual_table(policy.operator, labels, policy.types, seed=settings.seed)]
 
 
-def robustness(policy: OperatorPolicy, labels: Sequence[Extremal], settings: DictConfig) -> list[dict[str, Any]]:
+def robustness(policy: LearnedPolicy, labels: Sequence[Extremal], settings: DictConfig) -> list[dict[str, Any]]:
     """Collisions under every condition."""
     game, types = policy.game, [tuple(found.theta[0].tolist()) for found in labels]
 
@@ -67,15 +67,15 @@ SECTIONS: dict[str, Section] = {
         robustness, show_robustness, lambda policy, types, settings: conditions(policy.game, settings)
     ),
     "ntk": Section(
-        lambda policy, labels, settings: ntk_section(policy.operator, labels, settings),
+        ntk_section,
         lambda section, console: console.print(ntk_table(section)),
-        lambda policy, types, settings: check_ntk(policy.operator, types, settings),
+        check_ntk,
     ),
     "online": Section(online_section, show_online),
 }
 
 
-def check_sections(policy: OperatorPolicy, types: Types, settings: DictConfig) -> None:
+def check_sections(policy: LearnedPolicy, types: Types, settings: DictConfig) -> None:
     """Raise ValueError for entries that make no sections."""
     for name in ("residuals", "robustness", "ntk"):
         flag(name, settings[name])
@@ -86,7 +86,7 @@ def check_sections(policy: OperatorPolicy, types: Types, settings: DictConfig) -
 
 
 def run_sections(
-    policy: OperatorPolicy, labels: Sequence[Extremal], settings: DictConfig, results: Results
+    policy: LearnedPolicy, labels: Sequence[Extremal], settings: DictConfig, results: Results
 ) -> Iterator[tuple[str, Any]]:
     """Name and content of every section that is switched on, one after the other."""
     for name, section in SECTIONS.items():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 import shutil
 import time
 from collections.abc import Sequence
@@ -15,11 +14,19 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from hno.cli.build import build_data, build_game, build_operator, build_trainer, cache_folder, check_numbers
+from hno.cli.build import (
+    build_architecture,
+    build_data,
+    build_game,
+    build_objective,
+    build_settings,
+    cache_folder,
+    check_numbers,
+)  # fmt: skip
 from hno.cli.checks import whole_number
 from hno.cli.config import run_command
 from hno.cli.evaluate import check_evaluation, evaluate_policy, solve_tests
-from hno.cli.logs import finish_wandb, label_progress, send_lightning_to_hydra
+from hno.cli.logs import StepLines, finish_wandb, label_progress, loggers, progress_bar, send_lightning_to_hydra
 from hno.cli.media import publish
 from hno.cli.ntk import check_rows, ntk_section
 from hno.cli.results import Results, config_hash, plain
@@ -29,17 +36,15 @@ from hno.data.labels import Request, safe_labels_for
 from hno.data.trust import safe, summary
 from hno.games import Game
 from hno.games.grid import parse_types
-from hno.losses import Scales
-from hno.training.checkpoint import check_resumable, load_policy
+from hno.operators import make_operator
+from hno.training.checkpoint import Provenance, check_resumable, load_policy, record
 from hno.training.divergence import DivergedError
-from hno.training.polish import polish
-from hno.training.validation import BEST, ClosedLoopValidation
+from hno.training.fit import Fitted, fit
+from hno.training.optimizers import make_optimizer
+from hno.training.validation import BEST
 from hno.types import Extremal, part
 
 log = logging.getLogger(__name__)
-
-LONG = 20_000
-"""Steps from which on compiling pays: it takes some ten seconds and saves about a millisecond a step."""
 
 
 def main() -> None:
@@ -90,64 +95,62 @@ def _run(config: DictConfig, folder: Path, results: Results) -> None:
     check_evaluation(game, settings)
     unseen = game.validate_types(settings.types)
     if settings.ntk:
-        check_rows(build_operator(config, game), settings)
-    trainer = fit(config, folder, results)
-    policy = load_policy(folder / results.content["checkpoint"])
-    types = list(dict.fromkeys([*policy.operator.seen_types, *unseen]))
+        check_rows(make_operator(game, build_architecture(config)), settings)
+    fitted = train_operator(config, folder, results)
+    policy = load_policy(fitted.checkpoint)
+    types = list(dict.fromkeys([*policy.types, *unseen]))
     test = solve_tests(game, types, settings, cache_folder(config.data.cache), config.data.workers, results)
     evaluate_policy(policy, test, settings, results)
     if settings.ntk:
         began = time.perf_counter()
-        results.update(ntk=ntk_section(policy.operator, test, settings))
+        results.update(ntk=ntk_section(policy, test, settings))
         results.time("ntk", time.perf_counter() - began)
     results.update(status="finished")
-    publish(trainer.loggers, results.content, folder, trainer.global_step)
+    publish(fitted.trainer.loggers, results.content, folder, fitted.trainer.global_step)
 
 
-def fit(config: DictConfig, folder: Path, results: Results) -> L.Trainer:
+def train_operator(config: DictConfig, folder: Path, results: Results) -> Fitted:
     """Solve labels and train; the folder gets `last.ckpt` and `best.ckpt`, the results how it went and which to use."""
     check_numbers(config)
     L.seed_everything(config.seed, verbose=False)
     if config.trainer.threads is not None:
         torch.set_num_threads(config.trainer.threads)
-    operator = build_operator(config, build_game(config))
-    if config.trainer.compile and config.trainer.max_steps >= LONG:
-        operator.compile_kernels()
-    data = build_data(config, operator, label_progress())
-    operator.seen_types, operator.config_hash, operator.seed = data.type_list, config_hash(config), config.seed
+    game, architecture, objective = build_game(config), build_architecture(config), build_objective(config)
+    operator = make_operator(game, architecture)
+    terms = objective.used(exact_terminal=operator.meets_terminal)
+    data = build_data(config, game, frozenset(term.stream for term in terms.values()), label_progress())
+    origin = Provenance(config.operator.name, data.type_list, config.seed, config_hash(config))
+    entries, settings = record(game, architecture, origin), build_settings(config)
     check_validation(data.game, config.validation)
-    every, stop = config.trainer.validate_every, config.validation.stop_when_safe
-    validation = ClosedLoopValidation(folder, every, dt=config.evaluation.dt, stop=stop)
-    trainer = build_trainer(config, folder, validation)
-    if config.resume is not None:
-        check_resumable(config.resume, operator)
-    _take_over(None if config.resume is None else Path(config.resume).parent / BEST, folder / BEST)
+    make_optimizer(steps=settings.steps, **settings.optimizer)
+    makers = loggers(config, folder)
+    resume = None if config.resume is None else Path(config.resume)
+    if resume is not None:
+        check_resumable(resume, entries)
+    _take_over(None if resume is None else resume.parent / BEST, folder / BEST)
 
-    data.prepare_data()
     data.setup("fit")
     results.time("labels", data.label_seconds)
     results.update(label_statistics=label_statistics(data.extremals))
-    if config.loss.scaled:
-        operator.set_scales(Scales(*data.label_scales()))
-    validation.begin(validation_labels(config, data, results))
+    validation = validation_labels(config, data, results)
+    fitted = fit(
+        operator, objective, data, settings, folder,
+        validation=validation, record=entries, loggers=makers, callbacks=[progress(config)], resume=resume,
+    )  # fmt: skip
+    for name, seconds in fitted.seconds.items():
+        results.time(name, seconds)
+    results.update(
+        steps=fitted.trainer.global_step,
+        checkpoint=fitted.checkpoint.name,
+        metrics=fitted.metrics,
+        validation=None if fitted.best is None else fitted.best._asdict(),
+    )
+    return fitted
 
-    began = time.perf_counter()
-    trainer.fit(operator, datamodule=data, ckpt_path=config.resume, weights_only=True)
-    if config.trainer.polish:
-        before, after = polish(operator, data.large_batch(trainer.global_step), config.trainer.polish)
-        log.info("L-BFGS: loss %.4g, was %.4g", after, before)
-        validation.consider(trainer, operator)
-    # The callback saves at multiples of trainer.validate_every, which the last step need not be.
-    trainer.save_checkpoint(folder / "last.ckpt", weights_only=False)
-    results.time("training", time.perf_counter() - began - validation.seconds)
-    results.time("validation", validation.seconds)
-    losses = {name: float(value) for name, value in trainer.callback_metrics.items() if name.startswith("loss/")}
-    metrics = {name: loss for name, loss in losses.items() if not math.isnan(loss)}
-    metrics |= trainer.validate(operator, datamodule=data, verbose=False)[0]
-    checkpoint = BEST if (folder / BEST).exists() else "last.ckpt"
-    best = None if validation.best is None else validation.best._asdict()
-    results.update(steps=trainer.global_step, checkpoint=checkpoint, metrics=metrics, validation=best)
-    return trainer
+
+def progress(config: DictConfig) -> L.Callback:
+    """A live bar on a terminal, lines elsewhere."""
+    return progress_bar() or StepLines(config.trainer.print_every)
 
 
 def label_statistics(labels: Sequence[Extremal]) -> list[dict[str, Any]]:
@@ -167,7 +170,12 @@ def validation_labels(config: DictConfig, data: GameData, results: Results) -> l
         types = parse_types(data.game, choice.types)
         requests = [Request(theta, choice.starts, choice.seed, "validation") for theta in types]
         found, seconds = safe_labels_for(
-            data.game, requests, data.cache, config.data.workers, label_progress(), clearance=clearance
+            data.game,
+            requests,
+            cache_folder(config.data.cache),
+            config.data.workers,
+            label_progress(),
+            clearance=clearance,
         )
         results.time("validation_labels", seconds)
     selected = [part(labels, safe(labels, clearance)) for labels in found]

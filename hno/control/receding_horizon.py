@@ -7,6 +7,7 @@ import math
 import torch
 from torch import Tensor
 
+from hno.control.policy import Policy
 from hno.games import Game
 from hno.pontryagin.collocation import Iterate
 from hno.pontryagin.newton import Newton
@@ -17,7 +18,7 @@ ONLINE = Solver(newton=Newton(tolerance=1e-6), extra_nodes=30)
 """Solver settings while playing: its errors are far below those of holding a control."""
 
 
-class RecedingHorizon:
+class RecedingHorizon(Policy):
     """Controls of the open-loop equilibrium from the present states to the end of the game, solved again and again.
 
     The horizon shrinks with the time to go. An instance drives one batch of episodes: the first call searches from
@@ -47,7 +48,11 @@ class RecedingHorizon:
         self._calls, self._tau = 0, math.inf
         self._plans: list[Iterate] = []
 
-    def __call__(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
+    def reset(self, x0: Tensor, theta: Tensor) -> None:
+        """Forget the last episodes: the next call searches from nothing."""
+        self._calls, self._tau, self._plans = 0, math.inf, []
+
+    def act(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
         """Controls in physical units, (B,), (B, P, n), (B, P) -> (B, P, m), in the floating-point type of `x`.
 
         Raises:

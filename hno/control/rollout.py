@@ -9,21 +9,22 @@ import torch
 from torch import Tensor
 
 from hno.control.disturbance import Disturbance, believed, control_noise, normal, state_push
+from hno.control.policy import Policy, as_policy
 from hno.games import Game
 from hno.games.kinematics import separation
 from hno.pontryagin.integrate import runge_kutta
 from hno.types import Trajectory
 
-__all__ = ["Disturbance", "Policy", "control_steps", "rollout"]
+__all__ = ["Disturbance", "Player", "control_steps", "rollout"]
 
-Policy = Callable[[Tensor, Tensor, Tensor], Tensor]
-"""(tau (B,), x (B, P, n), theta (B, P)) -> controls (B, P, m)."""
+Player = Policy | Callable[[Tensor, Tensor, Tensor], Tensor]
+"""A policy, or a bare function (tau (B,), x (B, P, n), theta (B, P)) -> controls (B, P, m)."""
 
 
 @torch.no_grad()
 def rollout(
     game: Game,
-    policy: Policy,
+    policy: Player,
     x0: Tensor,
     theta: Tensor,
     dt: float = 0.02,
@@ -52,14 +53,15 @@ def rollout(
     steps = control_steps(game, dt)
     noise = control_noise(game, x0, theta, steps, disturbance)
     push = state_push(game, x0, theta, steps, disturbance)
-    play = _believing(game, policy, x0, theta, disturbance)
+    player = _believing(game, as_policy(policy), x0, theta, disturbance)
+    player.reset(x0, theta)
     x, value = x0, torch.zeros_like(theta)
     clearance = distance = torch.full_like(theta[:, 0], torch.inf)
     path, controls, answers = [x], list[Tensor](), list[Tensor]()
     for k in range(steps):
         tau = torch.full_like(theta[:, 0], game.horizon - k * dt)
         finite = x.isfinite().all(-1).all(-1)[:, None, None]
-        answers.append(play(tau, torch.where(finite, x, x0), theta).where(finite, torch.nan))
+        answers.append(player.act(tau, torch.where(finite, x, x0), theta).where(finite, torch.nan))
         u = answers[max(0, k - disturbance.delay)]
         if noise is not None:
             u = game.control_box.clamp(u + noise[:, k])
@@ -74,6 +76,7 @@ def rollout(
             x = after
         path.append(x)
         controls.append(u)
+        player.observe(torch.where(x.isfinite().all(-1).all(-1)[:, None, None], x, x0), u, dt)
     t = torch.linspace(0, game.horizon, steps + 1, dtype=x0.dtype, device=x0.device)
     value = value + game.terminal_value(x)
     return Trajectory(t, torch.stack(path, 1), torch.stack(controls, 1), value, clearance, distance)
@@ -96,14 +99,35 @@ def _believing(game: Game, policy: Policy, x0: Tensor, theta: Tensor, disturbanc
     if disturbance.belief == 0:
         return policy
     drawn = normal("belief", disturbance.seed, x0, theta, (game.players, game.players))
-    estimates = believed(game, theta, drawn, disturbance.belief).flatten(0, 1)
+    return _Believing(policy, believed(game, theta, drawn, disturbance.belief).flatten(0, 1))
 
-    def play(tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
-        copies = tau.repeat_interleave(game.players), x.repeat_interleave(game.players, 0)
-        answers = policy(*copies, estimates).unflatten(0, theta.shape)
+
+class _Believing(Policy):
+    """Each player asks the policy about the types that it believes in, and plays its own part of the answer.
+
+    Args:
+        policy: asked once for every player.
+        estimates: what each player takes all types to be, players running fastest, (B P, P).
+    """
+
+    def __init__(self, policy: Policy, estimates: Tensor) -> None:
+        self.policy, self.estimates, self.players = policy, estimates, estimates.shape[-1]
+
+    def _each(self, part: Tensor) -> Tensor:
+        return part.repeat_interleave(self.players, 0)
+
+    def reset(self, x0: Tensor, theta: Tensor) -> None:
+        """An episode begins."""
+        self.policy.reset(self._each(x0), self.estimates)
+
+    def act(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
+        """Controls, (B, P, m)."""
+        answers = self.policy.act(self._each(tau), self._each(x), self.estimates).unflatten(0, theta.shape)
         return answers.diagonal(dim1=1, dim2=2).mT
 
-    return play
+    def observe(self, x: Tensor, u: Tensor, dt: float) -> None:
+        """What happened."""
+        self.policy.observe(self._each(x), self._each(u), dt)
 
 
 def _between(start: Tensor, end: Tensor, points: int) -> Tensor:

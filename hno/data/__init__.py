@@ -1,5 +1,6 @@
-"""Labels, collocation points and the datamodule that mixes them."""
+"""Labels, sources of collocation points, and the datamodule that mixes them."""
 
-from hno.data.datamodule import GameData
+from hno.data.datamodule import Collocation, GameData, LabelPlan
+from hno.data.sources import make_sampler, sources
 
-__all__ = ["GameData"]
+__all__ = ["Collocation", "GameData", "LabelPlan", "make_sampler", "sources"]

@@ -6,6 +6,7 @@ import copy
 import hashlib
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,15 +17,20 @@ from torch.utils.data import DataLoader, Dataset, IterableDataset
 
 from hno.data.curriculum import Curriculum
 from hno.data.exchange import read_own
-from hno.data.labels import Report, Request, labels_for
+from hno.data.labels import Report, Request, default_cache, labels_for
 from hno.data.rows import rows_of
-from hno.data.sampling import check_shares, sample_states
+from hno.data.sources import Known, Pool, Sampler, make_sampler, sample_points
+from hno.data.trust import CLEARANCE, safe
 from hno.games import Game
 from hno.pontryagin.solve import Solver
 from hno.types import Batch, Extremal, Sample, Trajectory, Types, part
 
 BOX_TYPES = 32
 """Types that one batch of collocation points draws from the type box: the branch runs once for each."""
+MIXED: Mapping[str, float] = {"box": 0.3, "band": 0.2, "labels": 0.5}
+"""Shares of the default sampler."""
+BATCH_SIZES: Mapping[str, int | None] = {"bvp": 2048, "interior": 512, "terminal": 128}
+"""Rows per step of each stream by default."""
 
 
 class Visit(NamedTuple):
@@ -38,116 +44,162 @@ class Visit(NamedTuple):
     """States, (L, P, n)."""
 
 
+@dataclass(frozen=True)
+class LabelPlan:
+    """Which labels are solved, read or brought along."""
+
+    types: Sequence[Sequence[float]] = ()
+    """Player types with labels; the corners of the type box and points between them by default."""
+    trajectories: int = 160
+    """Labelled trajectories per type."""
+    validation: int = 16
+    """Trajectories per type that are held out."""
+    files: Sequence[Path] = ()
+    """Label files of your own, see `hno.data.exchange`; their types count as labelled."""
+    cache: Path | None = None
+    """Folder of label files; $HNO_CACHE or the user's cache folder by default."""
+    solver: Solver = Solver()
+    workers: int | None = None
+    """Label processes; the number of cores by default."""
+
+
+@dataclass(frozen=True)
+class Collocation:
+    """Which collocation points are drawn, and when."""
+
+    sampler: Sampler = field(default_factory=lambda: make_sampler(MIXED))
+    """Where they come from."""
+    curriculum: Curriculum = field(default_factory=lambda: Curriculum(0, 0))
+    """When collocation begins, how the window widens, and when it ends."""
+    types: str = "labelled"
+    """"labelled" draws their player types among those of the labels, "box" from the type box."""
+
+
 class GameData(L.LightningDataModule):
     """Labelled rows and collocation points of one game.
 
-    Only the streams in `streams` are built. Labels are solved where the cache lacks them.
+    Only the streams in `streams` are built. Labels are solved where the cache lacks them, and only if the stream of
+    labelled rows or a source of collocation points reads them.
 
     Args:
         game: the game.
         streams: stream names, of `hno.losses.STREAMS`.
-        types: player types with labels.
-        trajectories: labelled trajectories per type.
-        cache: folder of label files.
         seed: of start states, batches and collocation points.
+        labels: which labels there are.
+        collocation: which collocation points.
         batch_sizes: rows per step of each stream; None for every labelled row, each step.
-        curriculum: when collocation begins, how the window widens, and when it ends.
-        shares: where interior points come from, see `hno.data.sampling.SOURCES`.
-        interior_types: "labelled" draws the types of collocation points among `types`, "box" from the type box.
-        validation: trajectories per type that are held out.
-        solver: settings of the label solver.
-        workers: label processes; the number of cores by default.
-        files: label files of your own, see `hno.data.exchange`; their types count as labelled.
         report: called as labels are written.
+
+    Raises:
+        ValueError: sizes, types or shares that make no sense, or nothing to train on at some step.
     """
 
     def __init__(
         self,
         game: Game,
         streams: Collection[str],
-        types: Sequence[Sequence[float]],
-        trajectories: int,
-        cache: Path,
-        seed: int,
-        batch_sizes: Mapping[str, int | None],
-        curriculum: Curriculum,
-        shares: Mapping[str, float],
-        interior_types: str = "labelled",
-        validation: int = 8,
-        solver: Solver = Solver(),
-        workers: int | None = None,
-        files: Sequence[Path] = (),
+        seed: int = 0,
+        labels: LabelPlan = LabelPlan(),
+        collocation: Collocation | None = None,
+        batch_sizes: Mapping[str, int | None] = BATCH_SIZES,
         report: Report | None = None,
     ) -> None:
         super().__init__()
-        check_shares(shares)
-        if interior_types not in ("labelled", "box"):
-            raise ValueError(f"interior_types must be 'labelled' or 'box'; got {interior_types!r}.")
-        if "bvp" not in streams and (curriculum.start > 0 or curriculum.end is not None):
-            raise ValueError(
-                "Nothing is trained before collocation begins and after it ends: weigh a supervised term, or set "
-                "pretrain and finish to 0."
-            )
-        for name, size in {"trajectories": trajectories, "validation": validation, **batch_sizes}.items():
-            if size is not None and size < 1:
-                raise ValueError(f"The number of rows or trajectories {name!r} must be at least 1; got {size}.")
         self.game = copy.deepcopy(game)  # the operator moves its own to a device; batches are made on the CPU
-        self.streams, self.seed = frozenset(streams), seed
-        self.own = [read_own(path, game) for path in files]
-        for path, labels in zip(files, self.own, strict=True):
-            if len(labels.status) <= validation:
-                raise ValueError(
-                    f"{path} holds {len(labels.status)} labels and {validation} are held out: none is left to train "
-                    "on. Bring more, or lower data.validation."
-                )
-        solved = [tuple(map(float, theta)) for theta in types]
-        brought = [tuple(theta) for labels in self.own for theta in labels.theta.unique(dim=0).tolist()]
+        self.streams, self.seed, self.labels, self.report = frozenset(streams), seed, labels, report
+        self.collocation, self.batch_sizes = collocation or Collocation(), dict(batch_sizes)
+        self._check()
+        self.own = [read_own(path, game) for path in labels.files]
+        self._check_own()
+        solved = self.game.validate_types(labels.types or ([] if labels.files else self.game.default_types()))
+        brought = [tuple(theta) for own in self.own for theta in own.theta.unique(dim=0).tolist()]
         self.type_list = list(dict.fromkeys([*solved, *brought]))
-        if not self.type_list:
-            raise ValueError(
-                "There are no labelled types: name some in data.types, or files of your own in data.files."
-            )
         self.types = torch.tensor(self.type_list)
-        self.batch_sizes, self.curriculum, self.shares = dict(batch_sizes), curriculum, dict(shares)
-        self.interior_types, self.cache, self.solver, self.workers = interior_types, cache, solver, workers
-        self.report = report
-        self.requests = [Request(theta, trajectories + validation, seed, "train") for theta in solved]
-        self.validation = validation
+        self.requests = [Request(t, labels.trajectories + labels.validation, seed, "train") for t in solved]
         self.label_seconds = 0.0
         self.extremals: list[Extremal] = []
+        self.train_rows: Sample | None = None
+        self.val_rows: Sample | None = None
         self.visits: list[Visit] = []
         """The latest two validations."""
 
+    def _check(self) -> None:
+        if self.collocation.types not in ("labelled", "box"):
+            raise ValueError(f"data.interior_types must be 'labelled' or 'box'; got {self.collocation.types!r}.")
+        curriculum = self.collocation.curriculum
+        if "bvp" not in self.streams and (curriculum.start > 0 or curriculum.end is not None):
+            raise ValueError(
+                "Nothing is trained before collocation begins and after it ends: weigh a supervised term, or set "
+                "data.pretrain and data.finish to 0."
+            )
+        sizes = {"trajectories": self.labels.trajectories, "validation": self.labels.validation, **self.batch_sizes}
+        for name, size in sizes.items():
+            if size is not None and size < 1:
+                raise ValueError(f"The number of rows or trajectories {name!r} must be at least 1; got {size}.")
+            if size is None and name in self.streams and not self.needs_labels:
+                raise ValueError(f"Without labels, data.batch_sizes.{name} must be a number of rows; got {size}.")
+
+    def _check_own(self) -> None:
+        held_out = self.labels.validation
+        for path, found in zip(self.labels.files, self.own, strict=True):
+            if len(found.status) <= held_out:
+                raise ValueError(
+                    f"{path} holds {len(found.status)} labels and {held_out} are held out: none is left to train on. "
+                    "Bring more, or lower data.validation."
+                )
+
+    @property
+    def needs_labels(self) -> bool:
+        """Whether a stream or a source of collocation points reads labels."""
+        sampled = self.streams & {"interior", "terminal"}
+        return "bvp" in self.streams or (
+            bool(sampled) and any(share.source.needs_labels for share in self.collocation.sampler.values())
+        )
+
     def prepare_data(self) -> None:
-        """Solve what the cache lacks."""
-        if self.extremals:
+        """Solve what the cache lacks, if labels are needed."""
+        if self.extremals or not self.needs_labels:
             return
-        arguments = self.game, self.requests, self.cache, self.solver, self.workers, self.report
+        plan = self.labels
+        arguments = self.game, self.requests, plan.cache or default_cache(), plan.solver, plan.workers, self.report
         found, self.label_seconds = labels_for(*arguments)
         self.extremals = [*found, *self.own]
 
     def setup(self, stage: str) -> None:
         """Load labels into memory."""
+        self.prepare_data()
         if not self.extremals:
-            self.prepare_data()
-        held_out = -self.validation
+            return
+        held_out = -self.labels.validation
         self.train_rows = rows_of(self.game, [part(found, slice(held_out)) for found in self.extremals])
         self.val_rows = rows_of(self.game, self.held_out())
 
     def held_out(self) -> list[Extremal]:
-        """Labels that are not trained on, one set per labelled type."""
-        return [part(found, slice(-self.validation, None)) for found in self.extremals]
+        """Labels that are not trained on, one set per labelled type; none without labels."""
+        return [part(found, slice(-self.labels.validation, None)) for found in self.extremals]
 
-    def label_scales(self) -> tuple[Tensor, Tensor]:
-        """Mean absolute value, scalar, and mean absolute costate, (P, P, n), of the training labels.
+    def safe_held_out(self, clearance: float = CLEARANCE) -> list[Extremal]:
+        """Held-out labels of starts whose equilibrium keeps a clearance, one set per type that has any."""
+        selected = [part(found, safe(found, clearance)) for found in self.held_out()]
+        return [found for found in selected if len(found.status)]
 
-        A state that hardly matters keeps a thousandth of value / box width, so that dividing by its size is safe.
+    def scales(self) -> tuple[Tensor, Tensor]:
+        """Typical sizes of values, scalar, and of costates, (P, P, n).
+
+        The mean absolute values and costates of the training labels; without labels, the mean terminal value over the
+        PDE box, and that per width of the box. A state that hardly matters keeps a thousandth of value / box width, so
+        that dividing by its size is safe.
         """
+        width = self.game.state_box.width
+        if self.train_rows is None:
+            x = self.game.state_box.sample(4096, torch.Generator().manual_seed(self.seed))
+            value = self.game.terminal_value(x).abs().mean().clamp_min(1e-3)
+            return value, (value / width).expand(self.game.players, -1, -1).clone()
         labels = self.train_rows.labels
         assert labels is not None
         value = labels.value.abs().mean()
         value = torch.where(value > 0, value, torch.ones_like(value))
-        return value, labels.costate.abs().mean(0).maximum(1e-3 * value / self.game.state_box.width)
+        return value, labels.costate.abs().mean(0).maximum(1e-3 * value / width)
 
     def visit(self, played: Trajectory, step: int = -1) -> None:
         """Take note of where the episodes of a validation after some step went, as far as they stayed finite."""
@@ -162,51 +214,53 @@ class GameData(L.LightningDataModule):
         return {"visits": [visit._asdict() for visit in self.visits]}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Go on from it."""
+        """Restore it."""
         self.visits = [Visit(**visit) for visit in state_dict["visits"]]
 
-    def batch(self, step: int) -> Batch:
-        """The batch of one step, a pure function of (seed, step, rank), and of earlier `visits`."""
+    def batch(self, step: int, sizes: Mapping[str, int | None] | None = None) -> Batch:
+        """The batch of one step, a pure function of (seed, step, rank), and of earlier `visits`.
+
+        Args:
+            step: the training step.
+            sizes: rows of each stream, `batch_sizes` by default.
+        """
+        sizes = sizes or self.batch_sizes
         rank = self.trainer.global_rank if self.trainer is not None else 0
         generator = torch.Generator().manual_seed(_mix(step, self.seed, rank))
         batch: Batch = {}
-        if "bvp" in self.streams:
-            batch["bvp"] = self.train_rows.rows(self._row_numbers(generator))
-        if self.curriculum.active(step):
+        if "bvp" in self.streams and self.train_rows is not None:
+            rows, size = self.train_rows, sizes["bvp"]
+            chosen = torch.arange(rows.size) if size is None else torch.randint(rows.size, (size,), generator=generator)
+            batch["bvp"] = rows.rows(chosen)
+        if self.collocation.curriculum.active(step):
             for name in sorted(self.streams & {"interior", "terminal"}):
-                batch[name] = self._collocation(name, step, generator)
+                batch[name] = self._collocation(name, step, sizes[name], generator)
         return batch
 
     def large_batch(self, step: int) -> Batch:
         """All labelled rows, and collocation points in proportion to the usual batch."""
-        usual = self.batch_sizes
-        factor = math.ceil(self.train_rows.size / (usual["bvp"] or self.train_rows.size))
-        self.batch_sizes = {name: None if name == "bvp" or not size else factor * size for name, size in usual.items()}
-        try:
-            return self.batch(step)
-        finally:
-            self.batch_sizes = usual
+        usual, rows = self.batch_sizes, 1 if self.train_rows is None else self.train_rows.size
+        factor = math.ceil(rows / (usual["bvp"] or rows))
+        return self.batch(
+            step, {name: None if name == "bvp" or not size else factor * size for name, size in usual.items()}
+        )
 
-    def _row_numbers(self, generator: torch.Generator) -> Tensor:
-        size = self.batch_sizes["bvp"]
+    def _known(self, step: int) -> Known:
+        """What sources draw on at a step. Batches are drawn a step ahead: later validations do not count."""
+        rows, earlier = self.train_rows, [visit for visit in self.visits if visit.step < step]
+        labels = None if rows is None else Pool(rows.points.tau, rows.points.x)
+        return Known(labels, Pool(earlier[-1].tau, earlier[-1].x) if earlier else None)
+
+    def _collocation(self, stream: str, step: int, size: int | None, generator: torch.Generator) -> Sample:
         if size is None:
-            return torch.arange(self.train_rows.size)
-        return torch.randint(self.train_rows.size, (size,), generator=generator)
-
-    def _visited(self, step: int) -> tuple[Tensor, Tensor] | None:
-        """Where the latest validation before a step went. Batches are drawn a step ahead: later ones do not count."""
-        earlier = [visit for visit in self.visits if visit.step < step]
-        return (earlier[-1].tau, earlier[-1].x) if earlier else None
-
-    def _collocation(self, stream: str, step: int, generator: torch.Generator) -> Sample:
-        size = self.batch_sizes[stream] or self.train_rows.size
-        table = self.types
-        if self.interior_types == "box":
+            assert self.train_rows is not None
+            size = self.train_rows.size
+        plan, table = self.collocation, self.types
+        if plan.types == "box":
             table = self.game.type_box.sample(BOX_TYPES, generator)
         which = torch.randint(len(table), (size,), generator=generator)
-        labelled = self.train_rows.points.tau, self.train_rows.points.x
-        pools = {"labels": labelled, "rollout": self._visited(step) or labelled}
-        points = sample_states(self.game, table[which], self.shares, pools, self.curriculum.window(step), generator)
+        window = plan.curriculum.window(step)
+        points = sample_points(self.game, table[which], plan.sampler, self._known(step), window, generator)
         points = points._replace(tau=torch.zeros_like(points.tau)) if stream == "terminal" else points
         return Sample(points, types=Types(table, which))
 
@@ -215,9 +269,9 @@ class GameData(L.LightningDataModule):
         first = self.trainer.global_step if self.trainer is not None else 0
         return DataLoader(_Steps(self, first), batch_size=None)
 
-    def val_dataloader(self) -> DataLoader[Sample]:
-        """Held-out labelled rows, in one batch."""
-        return DataLoader(_Whole(self.val_rows), batch_size=None)
+    def val_dataloader(self) -> DataLoader[Sample] | list[Any]:
+        """Held-out labelled rows, in one batch; nothing without labels."""
+        return [] if self.val_rows is None else DataLoader(_Whole(self.val_rows), batch_size=None)
 
 
 class _Whole(Dataset[Sample]):

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torchmetrics import WeightedMeanAbsolutePercentageError
 
-from hno.control.rollout import Disturbance, Policy, rollout
+from hno.control.rollout import Disturbance, Player, rollout
 from hno.data.rows import rows_of
 from hno.evaluation.metrics import CollisionRate, Quantiles, SaturatedShare, clopper_pearson
 from hno.games import Game
@@ -70,7 +70,7 @@ class TypeRow(NamedTuple):
 
 def collision_table(
     game: Game,
-    policy: Policy,
+    policy: Player,
     labels: Sequence[Extremal],
     seen: Sequence[Sequence[float]],
     clearance: float = 0.02,
@@ -94,7 +94,7 @@ def collision_table(
 
 
 def play(
-    game: Game, policy: Policy, labels: Sequence[Extremal], dt: float, disturbance: Disturbance = Disturbance()
+    game: Game, policy: Player, labels: Sequence[Extremal], dt: float, disturbance: Disturbance = Disturbance()
 ) -> list[Trajectory]:
     """Episodes from the start states of labels, one set per set of labels. See `collision_table`."""
     starts = torch.cat([found.x[:, 0] for found in labels]).float()

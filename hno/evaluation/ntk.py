@@ -15,7 +15,7 @@ from torch.func import functional_call, jacrev, vmap
 
 from hno.data.rows import rows_of
 from hno.evaluation.spectrum import Spectrum, spectrum
-from hno.losses import Scales
+from hno.losses import View
 from hno.losses.hji import HJIResidual
 from hno.losses.supervised import CostateDeviation, ValueDeviation
 from hno.operators import ValueOperator
@@ -82,7 +82,7 @@ def rows_per_point(operator: ValueOperator) -> int:
 
 def points_per_block(operator: ValueOperator, memory: int = BLOCK_BYTES) -> int:
     """Points of which two blocks of J take no more than `memory` bytes, but at least one."""
-    row = 8 * sum(parameter.numel() for parameter in operator.net.parameters())
+    row = 8 * sum(parameter.numel() for parameter in operator.parameters())
     return max(1, memory // (2 * row * rows_per_point(operator)))
 
 
@@ -108,8 +108,9 @@ def tangent_kernels(operator: ValueOperator, sample: Sample, memory: int = BLOCK
         ours = jacobian(operator, sample.rows(block))
         for there, other in zip(places[: row + 1], blocks[: row + 1], strict=True):
             theirs = ours if other is block else jacobian(operator, sample.rows(other))
-            for kernel, part in ((trunk, "net.trunk."), (branch, "net.branch.")):
-                product = sum(ours[name] @ theirs[name].mT for name in ours if name.startswith(part))
+            for kernel, of_branch in ((trunk, False), (branch, True)):
+                names = [name for name in ours if (".branch." in name) == of_branch]
+                product = sum((ours[name] @ theirs[name].mT for name in names), torch.zeros(()))
                 assert isinstance(product, Tensor)
                 kernel[here, there] = product
                 kernel[there, here] = product.mT
@@ -124,7 +125,7 @@ def jacobian(operator: ValueOperator, sample: Sample) -> Parameters:
         sample: B labelled points of one type.
     """
     operator = copy.deepcopy(operator).double()
-    parameters = {name: tensor.detach() for name, tensor in operator.net.named_parameters(prefix="net")}
+    parameters = {name: tensor.detach() for name, tensor in operator.named_parameters()}
     labels, like = sample.labels, operator.value_scale
     assert labels is not None
     theta = sample.points.theta[0].to(like)
@@ -146,7 +147,7 @@ def residuals(operator: ValueOperator, parameters: Parameters, point: Sample) ->
 
     Args:
         operator: everything but the parameters.
-        parameters: of its net, their names beginning with "net.".
+        parameters: its own, by name.
         point: labelled, without a batch axis.
     """
     tau, x, theta = point.points
@@ -157,10 +158,7 @@ def residuals(operator: ValueOperator, parameters: Parameters, point: Sample) ->
         return found, found
 
     (in_time, in_state), found = jacrev(value, argnums=(0, 1), has_aux=True)(tau, x)
-    game, field, scales = (
-        operator.game,
-        Field(found, in_time, in_state),
-        Scales(operator.value_scale, operator.costate_scale),
-    )
-    parts = [term.residual(game, point, field) / term.scale(game, point, scales) for term in TERMS]
+    game, field = operator.game, Field(found, in_time, in_state)
+    view = View(game, point, field, operator.field, operator.scales, 0)
+    parts = [term.residual(view) / term.scale(view) for term in TERMS]
     return torch.cat([part.flatten() for part in parts])

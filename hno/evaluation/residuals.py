@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from hno.data.rows import rows_of
-from hno.data.sampling import sample_states
+from hno.data.sources import Known, Pool, make_sampler, sample_points
 from hno.evaluation.metrics import BinnedMean
 from hno.games import Game
-from hno.losses import Scales
+from hno.losses import View
 from hno.losses.hji import HJIResidual
 from hno.operators import ValueOperator
 from hno.types import Extremal, Points, Sample, Status
@@ -50,20 +50,26 @@ class ResidualRow(NamedTuple):
 
 
 def residual_table(
-    operator: ValueOperator, labels: Sequence[Extremal], points: int = 4096, seed: int = 0, bins: int = BINS
+    operator: ValueOperator,
+    labels: Sequence[Extremal],
+    seen: Sequence[Sequence[float]],
+    points: int = 4096,
+    seed: int = 0,
+    bins: int = BINS,
 ) -> list[ResidualRow]:
     """The residual by type, region and time to go.
 
     Args:
         operator: the value function.
         labels: one set per type; the converged ones are a region.
+        seen: types that the operator was trained with.
         points: in each other region.
         seed: of the points, which are the same whatever other types there are.
         bins: of time to go.
     """
-    seen = {tuple(float(t) for t in theta) for theta in operator.seen_types}
+    known = {tuple(float(t) for t in theta) for theta in seen}
     return [
-        _row(operator, tuple(float(t) for t in found.theta[0]), seen, region, where, bins)
+        _row(operator, tuple(float(t) for t in found.theta[0]), known, region, where, bins)
         for found in labels
         for region, where in zip(REGIONS, _regions(operator.game, found, points, seed), strict=True)
     ]
@@ -73,16 +79,17 @@ def _regions(game: Game, found: Extremal, size: int, seed: int) -> Iterator[Poin
     """Points of each of `REGIONS`, each from the same seed."""
     types = found.theta[:1].float().expand(size, -1)
 
-    def sampled(source: str, pools: Mapping[str, tuple[Tensor, Tensor]]) -> Points:
-        return sample_states(game, types, {source: 1.0}, pools, 1.0, torch.Generator().manual_seed(seed))
+    def sampled(source: str, labels: Pool | None = None) -> Points:
+        known = Known(labels, None)
+        return sample_points(game, types, make_sampler({source: 1.0}), known, 1.0, torch.Generator().manual_seed(seed))
 
     starts = game.initial_box.sample(size, torch.Generator().manual_seed(seed))
     yield Points(torch.full((size,), game.horizon), starts, types)
-    yield sampled("box", {})
-    yield sampled("band", {})
+    yield sampled("box")
+    yield sampled("band")
     if bool((found.status == Status.CONVERGED).any()):
         nodes = rows_of(game, [found]).points
-        yield sampled("labels", {"labels": (nodes.tau, nodes.x)})
+        yield sampled("labels", Pool(nodes.tau, nodes.x))
         yield nodes
     else:
         nothing = Points(types[:0, 0], found.x[:0, 0].float(), types[:0])
@@ -120,10 +127,10 @@ def _row(
 @torch.no_grad()
 def hji(operator: ValueOperator, points: Points) -> tuple[Tensor, Tensor]:
     """The HJI residual, 1/s, and the size that the loss measures it in, both (B, P)."""
-    term, sample = HJIResidual(), Sample(points)
-    residual = term.residual(operator.game, sample, operator.field(points))
-    scale = term.scale(operator.game, sample, Scales(operator.value_scale, operator.costate_scale))
-    return residual, scale.expand_as(residual)
+    term, field = HJIResidual(), operator.field(points)
+    view = View(operator.game, Sample(points), field, operator.field, operator.scales, 0)
+    residual = term.residual(view)
+    return residual, term.scale(view).expand_as(residual)
 
 
 def _number(value: Tensor) -> float | None:

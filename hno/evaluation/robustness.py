@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import torch
 
 from hno.control.disturbance import pushed_states
-from hno.control.rollout import Disturbance, Policy
+from hno.control.rollout import Disturbance, Player
 from hno.evaluation.closed_loop import classify, collided, excess_costs, median, play
 from hno.evaluation.metrics import clopper_pearson
 from hno.games import Game
@@ -99,7 +99,7 @@ def _check(place: str, entry: str, value: object) -> None:
 
 
 def robustness_table(
-    game: Game, policy: Policy, conditions: Sequence[Condition], labels_of: LabelsOf, clearance: float, dt: float
+    game: Game, policy: Player, conditions: Sequence[Condition], labels_of: LabelsOf, clearance: float, dt: float
 ) -> list[ConditionRow]:
     """Play the starts of labels under every condition.
 
@@ -115,7 +115,7 @@ def robustness_table(
 
 
 def _row(
-    game: Game, policy: Policy, condition: Condition, labels: Sequence[Extremal], clearance: float, dt: float
+    game: Game, policy: Player, condition: Condition, labels: Sequence[Extremal], clearance: float, dt: float
 ) -> ConditionRow:
     types, excess, costs = list[dict[str, Any]](), [], []
     for found, played in zip(labels, play(game, policy, labels, dt, condition.disturbance), strict=True):

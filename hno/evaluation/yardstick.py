@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from hno.control.receding_horizon import RecedingHorizon
-from hno.control.rollout import Disturbance, Policy, rollout
+from hno.control.rollout import Disturbance, Player, rollout
 from hno.evaluation.closed_loop import classify, collided, excess_costs, median
 from hno.evaluation.metrics import clopper_pearson
 from hno.games import Game
@@ -88,7 +88,7 @@ def safe_starts(labels: Sequence[Extremal], count: int, clearance: float) -> lis
 
 def compare(
     game: Game,
-    policy: Policy,
+    policy: Player,
     labels: Sequence[Extremal],
     types: Sequence[Sequence[float]],
     interval: int = 1,
@@ -146,7 +146,7 @@ def _solves(solver: RecedingHorizon, rows: Tensor) -> Solves:
 
 def latency(
     game: Game,
-    make_policy: Callable[[], Policy],
+    make_policy: Callable[[], Player],
     labels: Sequence[Extremal],
     every: int = 1,
     dt: float = 0.02,
@@ -183,7 +183,7 @@ def _quantile(seconds: Sequence[float], share: float) -> float | None:
 class _Timed:
     """A policy that notes how long its answers take, on the clock and on the processor."""
 
-    def __init__(self, policy: Policy) -> None:
+    def __init__(self, policy: Player) -> None:
         self.policy, self.seconds, self.processor = policy, list[float](), list[float]()
 
     def __call__(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:

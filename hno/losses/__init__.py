@@ -1,6 +1,7 @@
-"""Loss terms. A recipe is a short list of them; weights live in the configuration."""
+"""Loss terms and the objective that weighs them."""
 
-from hno.losses.base import STREAMS, LossTerm, Norm, Scales, losses, used_weights
+from hno.losses.base import STREAMS, LossTerm, Scales, View, losses
 from hno.losses.hji import hji_residual
+from hno.losses.objective import Norm, Objective, make_objective
 
-__all__ = ["STREAMS", "LossTerm", "Norm", "Scales", "hji_residual", "losses", "used_weights"]
+__all__ = ["STREAMS", "LossTerm", "Norm", "Objective", "Scales", "View", "hji_residual", "losses", "make_objective"]

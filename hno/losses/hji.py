@@ -7,8 +7,8 @@ from typing import final
 from torch import Tensor
 
 from hno.games import Game
-from hno.losses.base import LossTerm, Scales, losses
-from hno.types import Field, Points, Sample
+from hno.losses.base import LossTerm, View, losses
+from hno.types import Field, Points
 
 
 def hji_residual(game: Game, points: Points, field: Field) -> Tensor:
@@ -27,18 +27,18 @@ class HJIResidual(LossTerm):
 
     stream = "interior"
 
-    def residual(self, game: Game, sample: Sample, field: Field) -> Tensor:
+    def residual(self, view: View) -> Tensor:
         """(B, P), 1/s."""
-        return hji_residual(game, sample.points, field)
+        return hji_residual(view.game, view.sample.points, view.field)
 
-    def scale(self, game: Game, sample: Sample, scales: Scales) -> Tensor:
+    def scale(self, view: View) -> Tensor:
         """Size of values per horizon, plus the penalty at each point, (B, P).
 
         Without the penalty, points deep inside the violation set, where it is thousands of times larger and where no
         equilibrium goes, would make up the whole loss.
         """
-        points = sample.points
-        return scales.value / game.horizon + game.penalty(game.constraint(points.x, points.theta))
+        points = view.sample.points
+        return view.scales.value / view.game.horizon + view.game.penalty(view.game.constraint(points.x, points.theta))
 
 
 @final
@@ -49,10 +49,10 @@ class Boundary(LossTerm):
     stream = "terminal"
     met_by_exact_terminal = True
 
-    def residual(self, game: Game, sample: Sample, field: Field) -> Tensor:
+    def residual(self, view: View) -> Tensor:
         """(B, P)."""
-        return field.value - game.terminal_value(sample.points.x)
+        return view.field.value - view.game.terminal_value(view.sample.points.x)
 
-    def scale(self, game: Game, sample: Sample, scales: Scales) -> Tensor:
+    def scale(self, view: View) -> Tensor:
         """Size of values."""
-        return scales.value
+        return view.scales.value

@@ -6,44 +6,43 @@ from typing import final
 
 from torch import Tensor
 
-from hno.games import Game
-from hno.losses.base import LossTerm, Scales, losses
-from hno.types import Field, Labels, Sample
+from hno.losses.base import LossTerm, View, losses
+from hno.types import Labels
 
 
-def _labels(sample: Sample) -> Labels:
-    if sample.labels is None:
+def _labels(view: View) -> Labels:
+    if view.sample.labels is None:
         raise ValueError("A supervised term needs the labelled stream 'bvp'; this sample has points only.")
-    return sample.labels
+    return view.sample.labels
 
 
 @final
 @losses.register("value")
 class ValueDeviation(LossTerm):
-    """Predicted minus labelled value, (B, P)."""
+    """Predicted minus labelled value."""
 
     stream = "bvp"
 
-    def residual(self, game: Game, sample: Sample, field: Field) -> Tensor:
+    def residual(self, view: View) -> Tensor:
         """(B, P)."""
-        return field.value - _labels(sample).value
+        return view.field.value - _labels(view).value
 
-    def scale(self, game: Game, sample: Sample, scales: Scales) -> Tensor:
+    def scale(self, view: View) -> Tensor:
         """Size of values."""
-        return scales.value
+        return view.scales.value
 
 
 @final
 @losses.register("costate")
 class CostateDeviation(LossTerm):
-    """Predicted minus labelled costate, (B, P, P, n)."""
+    """Predicted minus labelled costate."""
 
     stream = "bvp"
 
-    def residual(self, game: Game, sample: Sample, field: Field) -> Tensor:
+    def residual(self, view: View) -> Tensor:
         """(B, P, P, n)."""
-        return field.costate - _labels(sample).costate
+        return view.field.costate - _labels(view).costate
 
-    def scale(self, game: Game, sample: Sample, scales: Scales) -> Tensor:
+    def scale(self, view: View) -> Tensor:
         """Size of each costate component."""
-        return scales.costate
+        return view.scales.costate

@@ -2,5 +2,9 @@
 
 from hno.operators.activations import activations
 from hno.operators.base import ValueOperator, operators
+from hno.operators.build import Architecture, Choice, make_operator
+from hno.operators.network import Network, networks
 
-__all__ = ["ValueOperator", "activations", "operators"]
+__all__ = [
+    "Architecture", "Choice", "Network", "ValueOperator", "activations", "make_operator", "networks", "operators",
+]  # fmt: skip

@@ -17,6 +17,9 @@ activations: Registry[Activation] = Registry("activation", "hno.operators")
 class Activation(nn.Module, abc.ABC):
     """phi(10 a z) with a trainable slope a, initially 0.1, shared by all layers of one net.
 
+    An activation of your own defines `core` alone; constructor arguments are options. Its initialisation is Xavier's
+    unless it overrides `init_`.
+
     It is a core between two affine maps, gain * core(factor * z) + shift. A net folds the maps into its weights, so
     that only the core is left to do for every row: tanh costs what a sigmoid does, much less than `torch.tanh`.
     """
@@ -42,29 +45,37 @@ class Activation(nn.Module, abc.ABC):
     def core(u: Tensor) -> Tensor:
         """The elementary function, any shape."""
 
+    def init_(self, layer: nn.Linear, *, first: bool) -> None:
+        """Initialise one linear layer in place: Xavier normal weights, zero bias.
+
+        Args:
+            layer: the layer.
+            first: whether it reads the net's input.
+        """
+        nn.init.xavier_normal_(layer.weight)
+        nn.init.zeros_(layer.bias)
+
+
+class ClosedFormActivation(Activation):
+    """An activation whose core's second derivative is a function of its value and its derivative.
+
+    Training is then faster: see `hno.operators.value_gradient`.
+    """
+
     @staticmethod
     @abc.abstractmethod
     def core_and_first_(u: Tensor) -> tuple[Tensor, Tensor]:
-        """The core and its derivative at `u`, whose memory may be taken."""
+        """The core and its derivative at `u`, whose memory they may overwrite."""
 
     @staticmethod
     @abc.abstractmethod
     def times_second_(x: Tensor, core: Tensor, first: Tensor) -> Tensor:
         """Multiply `x` by the core's second derivative, in place, given its value and its derivative."""
 
-    @abc.abstractmethod
-    def init_(self, layer: nn.Linear, *, first: bool) -> None:
-        """Initialise one linear layer in place.
-
-        Args:
-            layer: the layer.
-            first: whether it reads the net's input.
-        """
-
 
 @final
 @activations.register("tanh")
-class Tanh(Activation):
+class Tanh(ClosedFormActivation):
     """Hyperbolic tangent, tanh(z) = 2 sigmoid(2 z) - 1; Xavier initialisation."""
 
     gain = 2.0
@@ -92,15 +103,10 @@ class Tanh(Activation):
         x.mul_(first)
         return x.addcmul_(x, core, value=-2)
 
-    def init_(self, layer: nn.Linear, *, first: bool) -> None:
-        """Xavier normal weights, zero bias."""
-        nn.init.xavier_normal_(layer.weight)
-        nn.init.zeros_(layer.bias)
-
 
 @final
 @activations.register("relu")
-class ReLU(Activation):
+class ReLU(ClosedFormActivation):
     """Rectified linear unit, Kaiming initialisation."""
 
     @staticmethod
@@ -127,14 +133,14 @@ class ReLU(Activation):
 
 @final
 @activations.register("sin")
-class Sin(Activation):
+class Sin(ClosedFormActivation):
     """Sine with the SIREN initialisation (Sitzmann et al. 2020).
 
     Args:
-        frequency: omega_0, which multiplies every pre-activation.
+        frequency: omega_0, which multiplies every pre-activation; it was published with 30.
     """
 
-    def __init__(self, frequency: float = 30.0) -> None:
+    def __init__(self, frequency: float = 10.0) -> None:
         super().__init__()
         if not (math.isfinite(frequency) and frequency > 0):
             raise ValueError(f"activation.frequency must be a positive number; got {frequency!r}.")

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Mapping
-from types import MappingProxyType
-from typing import cast
+from collections.abc import Callable
+from typing import final
 
 import torch
 from torch import Tensor, nn
 
-from hno.operators.activations import Activation, activations
+from hno.operators.activations import Activation, ClosedFormActivation
+from hno.operators.network import Inputs, Network, networks
 from hno.operators.value_gradient import Kernels, Layer, value_gradient
 
 
@@ -54,95 +54,58 @@ class MLP(nn.Module):
         return hidden, folded[-1]
 
 
-class DeepONet(nn.Module):
+@final
+@networks.register("deeponet")
+class DeepONet(Network):
     """sum_k branch_k(a) trunk_k(y).
 
+    With several other players, the trunk sees the mean of what one shared net makes of each of them together with the
+    player itself (deep sets, Zaheer et al. 2017), so that their order does not matter.
+
     Args:
-        trunk_inputs: size of y, scaled time and states.
-        sensors: size of the branch input a.
-        activation: registered name, for both nets.
+        inputs: sizes.
+        activation: makes the activation of each net.
         width: hidden and output width.
         depth: hidden layers.
-        options: arguments of the activation.
     """
 
-    def __init__(
-        self,
-        trunk_inputs: int,
-        sensors: int,
-        activation: str,
-        width: int = 64,
-        depth: int = 4,
-        options: Mapping[str, float] = MappingProxyType({}),
-    ) -> None:
+    def __init__(self, inputs: Inputs, activation: Callable[[], Activation], width: int = 64, depth: int = 4) -> None:
         super().__init__()
-        hidden, make = (width,) * (depth + 1), activations.get(activation)
-        self.trunk = MLP((trunk_inputs, *hidden), make(**options))
-        self.branch = MLP((sensors, *hidden), make(**options))
+        self.inputs = inputs
+        hidden, several = (width,) * (depth + 1), inputs.others > 1
+        ego = inputs.ego + inputs.role
+        self.trunk = MLP((ego + width if several else inputs.total, *hidden), activation())
+        self.branch = MLP((inputs.sensors, *hidden), activation())
+        self.pair = MLP((ego + inputs.other, width, width), activation()) if several else None
         self.kernels: Kernels | None = None
 
     def forward(self, y: Tensor, sensors: Tensor, which: Tensor) -> Tensor:
-        """Value at each row.
-
-        Args:
-            y: trunk inputs, (R, trunk_inputs).
-            sensors: distinct branch inputs, (C, S): the branch runs once for each.
-            which: the branch input of each row, (R,).
-
-        Returns:
-            Shape (R,).
-        """
-        return torch.linalg.vecdot(self.trunk(y), self.branch(sensors)[which])
+        """Value at each row, (R,)."""
+        return torch.linalg.vecdot(self.trunk(self._pooled(y)), self.branch(sensors)[which])
 
     def value_gradient(self, y: Tensor, sensors: Tensor, which: Tensor) -> tuple[Tensor, Tensor]:
-        """Value at each row and its gradient in y, (R,) and (R, trunk_inputs), both differentiable in the parameters.
+        """Value at each row and its gradient in y.
 
-        The branch's output is folded into the trunk's last layer: rows of one branch input share a linear map.
-        Arguments as in `forward`.
+        With one other player and an activation that knows its derivatives it is one pass forward and one backward
+        (`hno.operators.value_gradient`). The branch's output is folded into the trunk's last layer: rows of one branch
+        input share a linear map.
         """
+        activation = self.trunk.activation
+        if self.pair is not None or not isinstance(activation, ClosedFormActivation):
+            return super().value_gradient(y, sensors, which)
         hidden, last = self.trunk.folded()
         branch = self.branch(sensors)
-        activation, coefficient = type(self.trunk.activation), branch @ last.weight
-        value, gradient = value_gradient(activation, y, which, coefficient, hidden, self.kernels)
+        coefficient = branch @ last.weight
+        value, gradient = value_gradient(type(activation), y.detach(), which, coefficient, hidden, self.kernels)
         return value + (branch @ last.bias)[which], gradient
 
-
-class Ensemble(nn.Module):
-    """Several nets, and the median of their values.
-
-    Where two equilibria cost nearly the same, each net rounds off the ridge between them in its own way; the median
-    follows the majority.
-
-    Args:
-        members: an odd number of them.
-    """
-
-    def __init__(self, members: Iterable[DeepONet]) -> None:
-        super().__init__()
-        self.members = nn.ModuleList(members)
-
-    def forward(self, y: Tensor, sensors: Tensor, which: Tensor) -> Tensor:
-        """Median value at each row, (R,); arguments as of a member."""
-        return torch.stack([net(y, sensors, which) for net in self.members]).median(0).values
-
-
-def median_of(members: int, make: Callable[[], DeepONet]) -> DeepONet | Ensemble:
-    """One net, or several with weights of their own.
-
-    Args:
-        members: how many, an odd number.
-        make: builds one.
-
-    Raises:
-        ValueError: `members` is no odd whole number.
-    """
-    if not (type(members) is int and members > 0 and members % 2):
-        raise ValueError(
-            f"operator.members must be an odd whole number, such as 1 or 3, so that there is a median; got {members!r}."
-        )
-    return make() if members == 1 else Ensemble(make() for _ in range(members))
-
-
-def nets(net: DeepONet | Ensemble) -> list[DeepONet]:
-    """The members of an ensemble, or the net itself."""
-    return cast(list[DeepONet], list(net.members)) if isinstance(net, Ensemble) else [net]
+    def _pooled(self, y: Tensor) -> Tensor:
+        """What the trunk sees, (R, trunk inputs)."""
+        if self.pair is None:
+            return y
+        sizes = self.inputs
+        own, others, role = y.split([sizes.ego, sizes.others * sizes.other, sizes.role], -1)
+        ego = torch.cat([own, role], -1)
+        blocks = others.unflatten(-1, (sizes.others, sizes.other))
+        pairs = torch.cat([ego.unsqueeze(1).expand(-1, sizes.others, -1), blocks], -1)
+        return torch.cat([ego, self.pair(pairs).mean(1)], -1)

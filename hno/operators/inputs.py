@@ -1,14 +1,76 @@
-"""What a network is fed with: states as each player sees them, and each type once."""
+"""What a network is fed with: times, states as each player sees them, roles, and each type once."""
 
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
+from hno.games import Game
+from hno.operators.network import Inputs
 from hno.types import Types
+
+
+class Encoding(nn.Module):
+    """Scaled network inputs of every player, itself first, and the way back for gradients.
+
+    Args:
+        game: the game.
+    """
+
+    roles: Tensor
+
+    def __init__(self, game: Game) -> None:
+        super().__init__()
+        self.game = [game]  # a list: the operator owns the game, whose buffers must not be saved twice
+        self.register_buffer("roles", torch.tensor(game.roles, dtype=game.state_box.lo.dtype), persistent=False)
+        self.has_roles, self.several = len(set(game.roles)) > 1, game.players > 2
+        self.periodic = list(getattr(game, "periodic", ()))
+        self.features = game.state_dim + len(self.periodic)
+        sensors = game.sensors((game.type_box.lo + game.type_box.hi) / 2).shape[-1]
+        other = self.features + self.several * (self.has_roles + 1)
+        self.sizes = Inputs(1 + self.features, other, game.players - 1, int(self.has_roles), sensors)
+
+    def forward(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
+        """Trunk inputs, (B,), (B, P, n), (B, P) -> (B, P, `Inputs.total`)."""
+        (game,) = self.game
+        states = self._features(x)
+        roles = self.roles.to(x).expand(theta.shape).unsqueeze(-1)
+        parts = [states, *([roles] if self.has_roles else []), game.type_box.scale(theta).to(x).unsqueeze(-1)]
+        others = ego_views(torch.cat(parts, -1) if self.several else states)[..., 1:, :].flatten(-2)
+        times = (2 * tau / game.horizon - 1)[..., None, None].expand(*states.shape[:-1], 1)
+        return torch.cat([times, states, others, *([roles] if self.has_roles else [])], -1)
+
+    def _features(self, x: Tensor) -> Tensor:
+        """Scaled states; those that wrap around as sine and cosine, (B, P, n) -> (B, P, features)."""
+        (game,) = self.game
+        scaled = game.state_box.scale(x)
+        if not self.periodic:
+            return scaled
+        angle = math.pi * scaled[..., self.periodic]
+        scaled = scaled.index_copy(-1, torch.tensor(self.periodic, device=x.device), angle.sin())
+        return torch.cat([scaled, angle.cos()], -1)
+
+    def time_slope(self, gradient: Tensor) -> Tensor:
+        """Gradient in y (B, P, `Inputs.total`) -> derivative in time to go, 1/s, (B, P)."""
+        return gradient[..., 0] * (2 / self.game[0].horizon)
+
+    def state_slope(self, gradient: Tensor, x: Tensor) -> Tensor:
+        """Gradient in y (B, P, `Inputs.total`) -> derivative of every player in every state, (B, P, P, n)."""
+        (game,) = self.game
+        sizes, own = self.sizes, gradient[..., None, 1 : 1 + self.features]
+        others = gradient[..., sizes.ego : sizes.total - sizes.role].unflatten(-1, (sizes.others, sizes.other))
+        views = torch.cat([own, others[..., : self.features]], -2)
+        slope = ego_views(views, inverse=True)
+        scaled = slope[..., : game.state_dim]
+        if self.periodic:
+            angle = math.pi * game.state_box.scale(x)[..., self.periodic].unsqueeze(-3)
+            turned = scaled[..., self.periodic] * angle.cos() - slope[..., game.state_dim :] * angle.sin()
+            scaled = scaled.index_copy(-1, torch.tensor(self.periodic, device=x.device), math.pi * turned)
+        return scaled * (2 / game.state_box.width)
 
 
 def ego_views(x: Tensor, *, inverse: bool = False) -> Tensor:

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from hno.operators.activations import Activation, activations
+from hno.operators.activations import ClosedFormActivation, Tanh
 
 log = logging.getLogger(__name__)
 
@@ -58,7 +58,7 @@ class Kernels(NamedTuple):
 
 
 def value_gradient(
-    activation: type[Activation],
+    activation: type[ClosedFormActivation],
     y: Tensor,
     which: Tensor,
     coefficient: Tensor,
@@ -90,7 +90,7 @@ class _ValueGradient(torch.autograd.Function):
     def forward(
         ctx: Any,
         kernels: Kernels,
-        activation: type[Activation],
+        activation: type[ClosedFormActivation],
         y: Tensor,
         which: Tensor,
         coefficient: Tensor,
@@ -126,7 +126,7 @@ class _ValueGradient(torch.autograd.Function):
 
 
 def _forward(
-    activation: type[Activation], y: Tensor, coefficient: Tensor, layers: Sequence[Layer]
+    activation: type[ClosedFormActivation], y: Tensor, coefficient: Tensor, layers: Sequence[Layer]
 ) -> tuple[Tensor, Tensor, _Block]:
     """Value (R,), gradient (R, inputs) and what their derivatives need."""
     inputs, firsts = [y], []
@@ -142,7 +142,7 @@ def _forward(
 
 
 def _backward(
-    activation: type[Activation],
+    activation: type[ClosedFormActivation],
     block: _Block,
     layers: Sequence[Layer],
     dvalue: Tensor,
@@ -176,7 +176,7 @@ def compiled() -> Kernels | None:
     y, which, coefficient = torch.zeros(8, 3), torch.zeros(8, dtype=torch.int64), torch.zeros(1, 4, requires_grad=True)
     layers = [Layer(torch.zeros(4, 3), torch.zeros(4)), Layer(torch.zeros(4, 4), torch.zeros(4))]
     try:
-        value, gradient = value_gradient(activations.get("tanh"), y, which, coefficient, layers, kernels)
+        value, gradient = value_gradient(Tanh, y, which, coefficient, layers, kernels)
         (value.sum() + gradient.sum()).backward()
     except (RuntimeError, OSError, ImportError) as error:
         log.warning("torch.compile does not work here, so nothing is compiled: %s", str(error).partition("\n")[0])

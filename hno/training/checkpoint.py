@@ -4,26 +4,58 @@ from __future__ import annotations
 
 import pickle
 import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, final
 
 import torch
-from torch import Tensor
 
-from hno.games import Game, make
-from hno.operators.base import SPEC_FORMAT, SPEC_KEY, ValueOperator, operators
-from hno.types import Points
+from hno.control.policy import Feedback
+from hno.games import Game, games, make
+from hno.operators import Architecture, Choice, ValueOperator, make_operator
+
+KEY = "hno"
+"""Checkpoint entry that says how to build the operator and where it comes from."""
+FORMAT = 3
+"""Version of that entry."""
 
 
 class CheckpointError(RuntimeError):
     """A file that is not a readable checkpoint of this package, or is one of another game."""
 
 
+@dataclass(frozen=True)
+class Provenance:
+    """Where an operator comes from."""
+
+    method: str = ""
+    """Name of its list of loss terms, such as "hno"."""
+    types: Sequence[tuple[float, ...]] = ()
+    """Player types that it was trained with."""
+    seed: int | None = None
+    config_hash: str = ""
+    """Of what determined the run's numbers."""
+
+
+def record(game: Game, architecture: Architecture, provenance: Provenance) -> dict[str, Any]:
+    """What a checkpoint needs to rebuild its operator, plain containers under `KEY`."""
+    content = {
+        "format": FORMAT,
+        "game": games.name_of(type(game)),
+        "constants": dict(game.constants),
+        "fingerprint": game.fingerprint(),
+        "architecture": asdict(architecture),
+        "provenance": asdict(provenance),
+    }
+    return {KEY: content}
+
+
 def read_checkpoint(path: str | Path) -> dict[str, Any]:
     """The content of a checkpoint; only tensors and plain containers are unpickled.
 
     Raises:
-        CheckpointError: no such file, truncated, or not written by this package.
+        CheckpointError: no such file, truncated, or not written by this version of the package.
     """
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
@@ -34,10 +66,13 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
         raise CheckpointError(
             f"{path} is not a readable checkpoint: truncated, foreign or unsafe ({reason})."
         ) from error
-    spec = content.get(SPEC_KEY) if isinstance(content, dict) else None
-    known = isinstance(spec, dict) and spec.get("format") == SPEC_FORMAT and spec.keys() >= _ENTRIES
-    if not known or "state_dict" not in content:
-        raise CheckpointError(f"{path} was not written by this version of hno: its entry {SPEC_KEY!r} is not complete.")
+    found = content.get(KEY) if isinstance(content, dict) else None
+    if not isinstance(found, dict) or "state_dict" not in content:
+        raise CheckpointError(f"{path} was not written by hno: its entry {KEY!r} is missing.")
+    if found.get("format") != FORMAT or not found.keys() >= _ENTRIES:
+        raise CheckpointError(
+            f"{path} has format {found.get('format')}, this version of hno reads format {FORMAT}: train it again."
+        )
     return content
 
 
@@ -46,25 +81,37 @@ _UNREADABLE = (
     zipfile.BadZipFile,
 )  # fmt: skip
 """What unpickling damaged or foreign bytes raises."""
-_ENTRIES = {"game", "constants", "fingerprint", "operator", "options", "seen_types"}
-"""Entries of a spec that loading needs."""
+_ENTRIES = {"game", "constants", "fingerprint", "architecture", "provenance"}
+"""Entries that loading needs."""
 
 
-def check_resumable(path: str | Path, operator: ValueOperator) -> None:
-    """Refuse to resume from a checkpoint that is not of this operator.
+def check_resumable(path: str | Path, expected: Mapping[str, Any]) -> None:
+    """Refuse to resume from a checkpoint whose record differs.
+
+    Args:
+        path: the checkpoint.
+        expected: what `record` gives for the run that is to go on.
 
     Raises:
-        CheckpointError: see `read_checkpoint`; or the checkpoint is of another game, operator or network.
+        CheckpointError: see `read_checkpoint`; or the checkpoint is of another game, operator or configuration.
     """
-    found, expected = read_checkpoint(path)[SPEC_KEY], operator.spec()
-    differing = [name for name in expected if name != "seen_types" and found.get(name) != expected[name]]
+    found, wanted = _flat(read_checkpoint(path)[KEY]), _flat(expected[KEY])
+    differing = sorted(name for name in found.keys() | wanted.keys() if found.get(name) != wanted.get(name))
     if differing:
-        pairs = "; ".join(f"{name} {found.get(name)!r}, expected {expected[name]!r}" for name in differing)
+        pairs = "; ".join(f"{name} {found.get(name)!r}, expected {wanted.get(name)!r}" for name in differing)
         raise CheckpointError(f"{path} is a checkpoint of something else: {pairs}. Resume with its own configuration.")
 
 
-def load_operator(path: str | Path, game: str | None = None) -> ValueOperator:
-    """The trained operator in a checkpoint, in evaluation mode.
+def _flat(content: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested mappings as one, with dotted names."""
+    flat: dict[str, Any] = {}
+    for name, value in content.items():
+        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {prefix + name: value}
+    return flat
+
+
+def load_operator(path: str | Path, game: str | None = None) -> tuple[ValueOperator, Architecture, Provenance]:
+    """The trained operator in a checkpoint, in evaluation mode, what it is built of and where it comes from.
 
     Args:
         path: a checkpoint that training wrote.
@@ -72,60 +119,52 @@ def load_operator(path: str | Path, game: str | None = None) -> ValueOperator:
 
     Raises:
         CheckpointError: see `read_checkpoint`; or the checkpoint is of another game, or its game has changed since.
-        UnknownNameError: its game or operator is not registered here.
+        UnknownNameError: its game or a part of its operator is not registered here.
     """
     content = read_checkpoint(path)
-    spec = content[SPEC_KEY]
-    if game is not None and spec["game"] != game:
-        raise CheckpointError(f"{path} is a checkpoint of game {spec['game']!r}, expected {game!r}.")
-    built = make(spec["game"], **spec["constants"])
-    if built.fingerprint() != spec["fingerprint"]:
-        raise CheckpointError(f"{path} was trained on another version of the game {spec['game']!r}. Train it again.")
+    found = content[KEY]
+    if game is not None and found["game"] != game:
+        raise CheckpointError(f"{path} is a checkpoint of game {found['game']!r}, expected {game!r}.")
+    built = make(found["game"], **found["constants"])
+    if built.fingerprint() != found["fingerprint"]:
+        raise CheckpointError(f"{path} was trained on another version of the game {found['game']!r}. Train it again.")
+    prefix = "operator."
+    weights = {name.removeprefix(prefix): w for name, w in content["state_dict"].items() if name.startswith(prefix)}
     try:
-        operator = operators.get(spec["operator"])(built, **spec["options"])
-        operator.load_state_dict(content["state_dict"])
-    except (RuntimeError, TypeError) as error:
-        raise CheckpointError(f"{path} does not hold the weights that its own entry {SPEC_KEY!r} describes.") from error
-    operator.seen_types = [tuple(theta) for theta in spec["seen_types"]]
-    operator.seed = spec.get("seed")
-    return operator.eval().requires_grad_(False)
+        architecture = Architecture(**{part: Choice(**choice) for part, choice in found["architecture"].items()})
+        provenance = Provenance(**found["provenance"])
+        operator = make_operator(built, architecture)
+        operator.load_state_dict(weights)
+    except (RuntimeError, TypeError, AttributeError) as error:
+        raise CheckpointError(f"{path} does not hold the weights that its own entry {KEY!r} describes.") from error
+    return operator.eval().requires_grad_(False), architecture, provenance
 
 
-class OperatorPolicy:
-    """Feedback controls of every player: the maximiser of the Hamiltonian at the operator's costates.
+@final
+class LearnedPolicy(Feedback):
+    """The policy of a trained operator, and where it comes from.
 
     Args:
-        operator: a trained operator.
+        operator: the operator.
+        architecture: what it is built of.
+        provenance: where it comes from.
     """
 
-    def __init__(self, operator: ValueOperator) -> None:
-        self.operator = operator
+    def __init__(self, operator: ValueOperator, architecture: Architecture, provenance: Provenance) -> None:
+        super().__init__(operator)
+        self.architecture, self.provenance = architecture, provenance
 
     @property
-    def game(self) -> Game:
-        """The game that the policy plays."""
-        return self.operator.game
+    def types(self) -> list[tuple[float, ...]]:
+        """Player types that it was trained with."""
+        return [tuple(theta) for theta in self.provenance.types]
 
-    def __call__(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
-        """Controls in physical units, (B,), (B, P, n), (B, P) -> (B, P, m), in the floating-point type of `x`.
-
-        Raises:
-            ValueError: shapes do not fit the game or each other, or an entry is not finite.
-        """
-        batch, joint = x.shape[:-2], (self.game.players, self.game.state_dim)
-        if x.shape[-2:] != joint or tau.shape != batch or theta.shape != (*batch, joint[0]):
-            raise ValueError(
-                f"Expected tau (B,), x (B, {joint[0]}, {joint[1]}) and theta (B, {joint[0]}); "
-                f"got {tuple(tau.shape)}, {tuple(x.shape)} and {tuple(theta.shape)}."
-            )
-        self.game.check_theta(theta)
-        if not bool(tau.isfinite().all() & x.isfinite().all()):
-            raise ValueError("tau and x must be finite; a controller has no answer to NaN or infinite entries.")
-        dtype = self.operator.value_scale.dtype
-        points = Points(tau.to(dtype), x.to(dtype), theta.to(dtype))
-        return self.game.optimal_control(points.x, self.operator.field(points).costate).to(x.dtype)
+    def names(self) -> dict[str, str]:
+        """Names of game, method and activation."""
+        game = games.name_of(type(self.game))
+        return {"game": game, "operator": self.provenance.method, "activation": self.architecture.activation.name}
 
 
-def load_policy(path: str | Path) -> OperatorPolicy:
-    """The policy of the operator in a checkpoint. Raises as `load_operator`."""
-    return OperatorPolicy(load_operator(path))
+def load_policy(path: str | Path, game: str | None = None) -> LearnedPolicy:
+    """The policy of the operator in a checkpoint. Arguments and errors as of `load_operator`."""
+    return LearnedPolicy(*load_operator(path, game))

@@ -1,14 +1,12 @@
-"""What watches a training run."""
+"""Ends a training that diverges."""
 
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import Any
 
 import lightning as L
 import torch
-from lightning.pytorch.callbacks import ModelCheckpoint
 
 
 class DivergedError(RuntimeError):
@@ -55,7 +53,7 @@ class StopOnDivergence(L.Callback):
         return {"smallest": self.smallest}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Go on from it."""
+        """Restore it."""
         self.smallest = state_dict["smallest"]
 
     def on_exception(self, trainer: L.Trainer, pl_module: L.LightningModule, exception: BaseException) -> None:
@@ -73,14 +71,3 @@ class StopOnDivergence(L.Callback):
 
 ERROR = "val/costate_error"
 _ADVICE = "Lower optimizer.lr or set trainer.gradient_clip_val."
-
-
-def checkpoints(folder: Path, every: int) -> ModelCheckpoint:
-    """Keep `last.ckpt` in the folder, written every so many steps."""
-    return ModelCheckpoint(
-        dirpath=folder,
-        filename="last",
-        every_n_train_steps=every,
-        save_on_train_epoch_end=False,
-        enable_version_counter=False,
-    )

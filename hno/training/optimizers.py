@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import inspect
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import Any
 
 import torch
@@ -12,8 +11,8 @@ from pytorch_optimizer import SOAP, Muon
 from torch import nn
 from torch.optim.lr_scheduler import LambdaLR
 
-from hno.operators.base import Optimizer
-from hno.registry import UnknownNameError, unknown_name
+from hno.registry import Registry, UnknownNameError, check_options, unknown_name
+from hno.training.module import Optimizer
 
 
 def muon(
@@ -41,20 +40,24 @@ def muon(
     return Muon(groups, lr, momentum, weight_decay, ns_steps=ns_steps, adamw_lr=adamw_lr)
 
 
-OPTIMIZERS: dict[str, Callable[..., torch.optim.Optimizer]] = {
-    "adam": torch.optim.Adam,
-    "adamw": torch.optim.AdamW,
-    "muon": muon,
-    "soap": SOAP,
-}
+optimizers: Registry[Any] = Registry("optimizer", "hno.training")
+"""Optimisers: classes or functions (parameters, lr=..., **options) -> `torch.optim.Optimizer`."""
+FACTORIES: dict[str, Any] = {"adam": torch.optim.Adam, "adamw": torch.optim.AdamW, "muon": muon, "soap": SOAP}
+for _name, _factory in FACTORIES.items():
+    optimizers.register(_name)(_factory)
+
 SCHEDULES = ("constant", "cosine", "linear")
+OWN = ("params", "parameters", "lr")
+"""Parameters of an optimiser that are no options."""
 
 
-def make_optimizer(name: str, steps: int, lr: float, schedule: str, final_lr: float, **options: Any) -> Optimizer:
+def make_optimizer(
+    name: str, steps: int, lr: float = 3e-3, schedule: str = "cosine", final_lr: float = 3e-5, **options: Any
+) -> Optimizer:
     """An optimiser with a schedule over the whole run.
 
     Args:
-        name: one of `OPTIMIZERS`.
+        name: registered name.
         steps: length of the run.
         lr: initial learning rate.
         schedule: one of `SCHEDULES`.
@@ -64,17 +67,13 @@ def make_optimizer(name: str, steps: int, lr: float, schedule: str, final_lr: fl
     Raises:
         UnknownNameError: unknown optimiser, schedule or option.
     """
-    if name not in OPTIMIZERS:
-        raise UnknownNameError(unknown_name("optimizer", name, sorted(OPTIMIZERS)))
+    factory = optimizers.get(name)
     if schedule not in SCHEDULES:
         raise UnknownNameError(unknown_name("schedule", schedule, list(SCHEDULES)))
-    known = sorted(set(inspect.signature(OPTIMIZERS[name]).parameters) - {"params", "parameters", "lr", "kwargs"})
-    for option in options:
-        if option not in known:
-            raise UnknownNameError(unknown_name(f"option of {name}", option, known))
+    check_options(f"optimizer {name}", factory, options, skip=OWN)
 
     def build(parameters: Iterable[nn.Parameter]) -> dict[str, Any]:
-        optimizer = OPTIMIZERS[name](parameters, lr=lr, **options)
+        optimizer = factory(parameters, lr=lr, **options)
         if schedule == "constant":
             return {"optimizer": optimizer}
         falling = _falling(optimizer, steps, final_lr / lr, schedule)

@@ -7,29 +7,29 @@ import copy
 import torch
 from torch import Tensor
 
-from hno.operators.base import ValueOperator
+from hno.training.module import TrainingModule
 from hno.types import Batch
 
 
-def polish(operator: ValueOperator, batch: Batch, iterations: int) -> tuple[float, float]:
+def polish(module: TrainingModule, batch: Batch, iterations: int) -> tuple[float, float]:
     """Lower the loss of a batch by L-BFGS with a line search; weights that are no better are put back.
 
     Args:
-        operator: a trained operator, changed in place.
+        module: a trained operator, changed in place, and its objective; terms are not balanced.
         batch: fixed for all iterations.
         iterations: at most so many.
 
     Returns:
         The loss before and after.
     """
-    weights = copy.deepcopy(operator.net.state_dict())
+    operator = module.operator
+    weights = copy.deepcopy(operator.state_dict())
     optimizer = torch.optim.LBFGS(
-        operator.net.parameters(), max_iter=iterations, history_size=30, line_search_fn="strong_wolfe"
+        operator.parameters(), max_iter=iterations, history_size=30, line_search_fn="strong_wolfe"
     )
 
     def loss() -> Tensor:
-        terms = operator.loss_terms(batch)
-        return torch.stack([operator.weights[name] * term for name, term in terms.items()]).sum()
+        return module.objective.total(module.losses(batch))
 
     def closure() -> float:
         optimizer.zero_grad()
@@ -43,6 +43,6 @@ def polish(operator: ValueOperator, batch: Batch, iterations: int) -> tuple[floa
     with torch.no_grad():
         after = float(loss())
     if not after <= before:
-        operator.net.load_state_dict(weights)
+        operator.load_state_dict(weights)
         return before, before
     return before, after

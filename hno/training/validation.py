@@ -12,10 +12,11 @@ import lightning as L
 import torch
 from torch import Tensor
 
+from hno.control.policy import Feedback
 from hno.control.rollout import rollout
 from hno.data import GameData
-from hno.operators import ValueOperator
-from hno.types import Extremal, Points, Trajectory, part
+from hno.training.module import TrainingModule
+from hno.types import Extremal, Trajectory, part
 
 log = logging.getLogger(__name__)
 
@@ -102,7 +103,7 @@ class ClosedLoopValidation(L.Callback):
         self, trainer: L.Trainer, pl_module: L.LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         """Validate where it is time to."""
-        assert isinstance(pl_module, ValueOperator)
+        assert isinstance(pl_module, TrainingModule)
         step = trainer.global_step
         if step % self.every and step != trainer.max_steps:
             return
@@ -113,12 +114,12 @@ class ClosedLoopValidation(L.Callback):
         if self.stop and found.collision_rate == 0:
             trainer.should_stop = True
 
-    def consider(self, trainer: L.Trainer, operator: ValueOperator) -> Score | None:
+    def consider(self, trainer: L.Trainer, module: TrainingModule) -> Score | None:
         """Play, if there are starts, and write `best.ckpt` if nothing was better so far."""
         if self.all is None:
             return None
         began = time.perf_counter()
-        found = self.play(trainer, operator, self.all)
+        found = self.play(trainer, module, self.all)
         better = found.after(self.best)
         if better is not None:
             self.best = better
@@ -126,14 +127,10 @@ class ClosedLoopValidation(L.Callback):
         self.seconds += time.perf_counter() - began
         return found
 
-    def play(self, trainer: L.Trainer, operator: ValueOperator, starts: Starts) -> Score:
+    def play(self, trainer: L.Trainer, module: TrainingModule, starts: Starts) -> Score:
         """The score on the probe if that collides, otherwise on all starts; the data are told where the probe went."""
-
-        def policy(tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
-            """As `OperatorPolicy`, but an operator that diverged just collides."""
-            return game.optimal_control(x, operator.field(Points(tau, x, theta)).costate)
-
-        game, probe, starts = operator.game, self.probe.like(operator.value_scale), starts.like(operator.value_scale)
+        policy, like = Feedback(module.operator, checked=False), module.operator.value_scale
+        game, probe, starts = policy.game, self.probe.like(like), starts.like(like)
         played = rollout(game, policy, probe.x0, probe.theta, self.dt)
         data = getattr(trainer, "datamodule", None)
         if isinstance(data, GameData):

@@ -1,0 +1,71 @@
+"""What a network is: a scalar function of scaled inputs and of a branch input, with its gradient."""
+
+from __future__ import annotations
+
+import abc
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from hno.registry import Registry
+
+networks: Registry[Network] = Registry("network", "hno.operators")
+
+
+class Inputs(NamedTuple):
+    """Sizes of what a network is fed with.
+
+    A row of y holds what a player sees of itself, a block of equal layout for every other player, and its role where
+    roles differ. Players who are interchangeable have interchangeable blocks: a network for more than two players must
+    not depend on their order.
+    """
+
+    ego: int
+    """Scaled time to go and the player's own scaled state."""
+    other: int
+    """The scaled state of another player and, where there are several, its role and its scaled type."""
+    others: int
+    """Number of other players, P - 1."""
+    role: int
+    """1 where roles differ, otherwise 0."""
+    sensors: int
+    """Branch input."""
+
+    @property
+    def total(self) -> int:
+        """Size of y."""
+        return self.ego + self.others * self.other + self.role
+
+
+class Network(nn.Module, abc.ABC):
+    """N(y, a): one number for each row of scaled inputs y and each branch input a.
+
+    A registered network is built as `cls(inputs, activation, **options)` with `Inputs` and the registered name and
+    options of an activation bound into `activation()`, which makes a new one at every call.
+    """
+
+    @abc.abstractmethod
+    def forward(self, y: Tensor, sensors: Tensor, which: Tensor) -> Tensor:
+        """Value at each row, differentiable in everything.
+
+        Args:
+            y: scaled inputs, (R, `Inputs.total`).
+            sensors: distinct branch inputs, (C, S): what depends on them alone is computed once for each.
+            which: the branch input of each row, (R,).
+
+        Returns:
+            Shape (R,).
+        """
+
+    def value_gradient(self, y: Tensor, sensors: Tensor, which: Tensor) -> tuple[Tensor, Tensor]:
+        """Value at each row and its gradient in y, (R,) and (R, `Inputs.total`), differentiable in the parameters.
+
+        By autograd; a network that knows a faster way overrides it. Arguments as in `forward`.
+        """
+        training = torch.is_grad_enabled()
+        with torch.inference_mode(False), torch.enable_grad():
+            point = y.detach().clone().requires_grad_()
+            value = self(point, sensors.clone(), which.clone())
+            (gradient,) = torch.autograd.grad(value.sum(), point, create_graph=training)
+        return (value, gradient) if training else (value.detach(), gradient)

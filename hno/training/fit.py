@@ -1,0 +1,164 @@
+"""Training as a library call."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import lightning as L
+from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.loggers import Logger
+
+from hno.data import GameData
+from hno.losses import Objective, Scales
+from hno.operators import ValueOperator
+from hno.training.divergence import StopOnDivergence
+from hno.training.module import TrainingModule
+from hno.training.optimizers import make_optimizer
+from hno.training.polish import polish
+from hno.training.validation import BEST, ClosedLoopValidation, Score
+from hno.types import Extremal
+
+log = logging.getLogger(__name__)
+
+LAST = "last.ckpt"
+"""Name of the latest checkpoint inside a run's folder."""
+LONG = 20_000
+"""Steps from which on compiling pays: it takes some ten seconds and saves about a millisecond a step."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How an operator is trained."""
+
+    steps: int = 2000
+    optimizer: Mapping[str, Any] = field(default_factory=lambda: {"name": "soap"})
+    """Name and options, see `hno.training.optimizers.make_optimizer`."""
+    validate_every: int = 500
+    """Steps between validations and checkpoints."""
+    stop_when_safe: bool = False
+    """End the training as soon as no validation start collides."""
+    dt: float = 0.02
+    """Time for which validation episodes hold a control, s."""
+    accelerator: str = "auto"
+    devices: int | str | list[int] = 1
+    precision: Any = "32-true"
+    gradient_clip_val: float | None = None
+    polish: int = 0
+    """Iterations of L-BFGS on all labelled rows after the last step."""
+    compile: bool = True
+    """`torch.compile` in runs of at least `LONG` steps."""
+
+
+class Fitted(NamedTuple):
+    """What came of a training."""
+
+    trainer: L.Trainer
+    checkpoint: Path
+    """The best checkpoint by closed-loop validation, or the last one where there was none."""
+    metrics: dict[str, float]
+    """Losses of the last step, and errors on held-out labels."""
+    best: Score | None
+    """Of closed-loop validation."""
+    seconds: dict[str, float]
+    """Time spent on training and on validation, s."""
+
+
+def fit(
+    operator: ValueOperator,
+    objective: Objective,
+    data: GameData,
+    settings: Settings,
+    folder: Path,
+    *,
+    validation: Sequence[Extremal] | None = None,
+    record: Mapping[str, Any] | None = None,
+    loggers: Sequence[Logger] = (),
+    callbacks: Sequence[L.Callback] = (),
+    resume: Path | None = None,
+) -> Fitted:
+    """Train an operator; the folder gets `last.ckpt` and, with closed-loop validation, `best.ckpt`.
+
+    Args:
+        operator: changed in place.
+        objective: loss terms and weights.
+        data: its streams are those of the objective.
+        settings: how to train.
+        folder: where checkpoints go.
+        validation: labels of safe starts that closed-loop validation plays, one set per type; without any there is
+            none. The safe starts of held-out labels by default.
+        record: entries of checkpoints besides the weights, see `hno.training.checkpoint.record`.
+        loggers: of Lightning.
+        callbacks: of Lightning, besides those that watch the run.
+        resume: a checkpoint of the same run to go on from.
+
+    Raises:
+        DivergedError: the loss, or the error on held-out labels, is no longer sound.
+    """
+    optimizer = make_optimizer(steps=settings.steps, **settings.optimizer)
+    module = TrainingModule(operator, objective, optimizer, record=lambda: dict(record or {}))
+    if settings.compile and settings.steps >= LONG:
+        operator.compile_kernels()
+    data.setup("fit")
+    if objective.scaled:
+        operator.set_scales(Scales(*data.scales()))
+    watch = ClosedLoopValidation(folder, settings.validate_every, dt=settings.dt, stop=settings.stop_when_safe)
+    watch.begin(data.safe_held_out() if validation is None else validation)
+    trainer = make_trainer(settings, folder, loggers, [watch, *callbacks])
+    began = time.perf_counter()
+    trainer.fit(module, datamodule=data, ckpt_path=resume, weights_only=True)
+    if settings.polish:
+        before, after = polish(module, data.large_batch(trainer.global_step), settings.polish)
+        log.info("L-BFGS: loss %.4g, was %.4g", after, before)
+        watch.consider(trainer, module)
+    # The callback saves at multiples of `validate_every`, which the last step need not be.
+    trainer.save_checkpoint(folder / LAST, weights_only=False)
+    seconds = {"training": time.perf_counter() - began - watch.seconds, "validation": watch.seconds}
+    losses = {name: float(value) for name, value in trainer.callback_metrics.items() if name.startswith("loss/")}
+    metrics = {name: loss for name, loss in losses.items() if not math.isnan(loss)}
+    if data.val_rows is not None:
+        metrics |= trainer.validate(module, datamodule=data, verbose=False)[0]
+    checkpoint = folder / (BEST if (folder / BEST).exists() else LAST)
+    return Fitted(trainer, checkpoint, metrics, watch.best, seconds)
+
+
+def make_trainer(
+    settings: Settings, folder: Path, loggers: Sequence[Logger], callbacks: Sequence[L.Callback]
+) -> L.Trainer:
+    """A trainer that runs for a number of steps and leaves `last.ckpt` in the folder."""
+    every = settings.validate_every
+    progress = [callback for callback in callbacks if isinstance(callback, L.pytorch.callbacks.ProgressBar)]
+    return L.Trainer(
+        accelerator=settings.accelerator,
+        devices=settings.devices,
+        precision=settings.precision,
+        max_steps=settings.steps,
+        max_epochs=-1,
+        gradient_clip_val=settings.gradient_clip_val,
+        val_check_interval=min(every, settings.steps),
+        check_val_every_n_epoch=None,
+        num_sanity_val_steps=0,
+        log_every_n_steps=max(1, min(50, settings.steps)),
+        logger=list(loggers) or False,
+        callbacks=[StopOnDivergence(min(50, every)), *callbacks, _checkpoints(folder, every)],
+        enable_progress_bar=bool(progress),
+        enable_model_summary=False,
+        default_root_dir=folder,
+        inference_mode=False,
+    )
+
+
+def _checkpoints(folder: Path, every: int) -> ModelCheckpoint:
+    """Keep `last.ckpt` in the folder, written every so many steps."""
+    return ModelCheckpoint(
+        dirpath=folder,
+        filename=Path(LAST).stem,
+        every_n_train_steps=every,
+        save_on_train_epoch_end=False,
+        enable_version_counter=False,
+    )

@@ -1,0 +1,109 @@
+"""The only LightningModule: an operator, an objective and an optimiser."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+import lightning as L
+import torch
+from torch import Tensor, nn
+from torchmetrics import WeightedMeanAbsolutePercentageError
+
+from hno.losses import Objective, View
+from hno.operators.base import FieldFunction, ValueOperator
+from hno.operators.inputs import distinct_types, tables
+from hno.types import Batch, Field, Points, Sample
+
+Optimizer = Callable[[Iterable[nn.Parameter]], Mapping[str, Any]]
+"""Builds what Lightning's `configure_optimizers` returns."""
+
+
+class TrainingModule(L.LightningModule):
+    """Trains an operator.
+
+    Args:
+        operator: what is trained.
+        objective: loss terms and weights.
+        optimizer: needed for training only.
+        record: called as a checkpoint is written; its entries are added to it.
+    """
+
+    def __init__(
+        self,
+        operator: ValueOperator,
+        objective: Objective,
+        optimizer: Optimizer | None = None,
+        record: Callable[[], Mapping[str, Any]] = dict,
+    ) -> None:
+        super().__init__()
+        self.operator, self.objective, self.optimizer, self.record = operator, objective, optimizer, record
+        self.terms = objective.used(exact_terminal=operator.meets_terminal)
+        self.value_error = WeightedMeanAbsolutePercentageError()
+        self.costate_error = WeightedMeanAbsolutePercentageError()
+
+    @property
+    def streams(self) -> frozenset[str]:
+        """Data streams that the terms read."""
+        return frozenset(term.stream for term in self.terms.values())
+
+    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        """Weighted sum of the terms whose stream is in the batch; the others are logged as NaN."""
+        losses = self.losses(batch)
+        total = self.objective.total(losses, train=True)
+        absent = dict.fromkeys(self.terms, torch.tensor(torch.nan))
+        self.log_dict({f"loss/{name}": loss.detach() for name, loss in (absent | losses).items()})
+        self.log("loss/total", total.detach(), prog_bar=True)
+        return total
+
+    def losses(self, batch: Batch) -> dict[str, Tensor]:
+        """Reduced terms whose stream is in the batch, mean over the operator's members, scalars by name."""
+        kept = {name: self._hardest(name, sample) for name, sample in batch.items() if name in self.streams}
+        read = {name: term.stream for name, term in self.terms.items() if term.stream in kept}
+        points = Points(*(torch.cat(parts) for parts in zip(*(s.points for s in kept.values()), strict=True)))
+        types = tables([sample.types or distinct_types(sample.points.theta) for sample in kept.values()])
+        sizes = [sample.size for sample in kept.values()]
+        reduced: dict[str, list[Tensor]] = {name: [] for name in read}
+        for member in self.operator.members:
+            columns = (part.split(sizes) for part in member(points, types))
+            fields = dict(zip(kept, (Field(*parts) for parts in zip(*columns, strict=True)), strict=True))
+            for name, stream in read.items():
+                view = self._view(kept[stream], fields[stream], member)
+                reduced[name].append(self.objective.reduced(name, view))
+        return {name: torch.stack(each).mean() for name, each in reduced.items()}
+
+    def _view(self, sample: Sample, field: Field, member: FieldFunction) -> View:
+        operator = self.operator
+        return View(operator.game, sample, field, lambda at: member(at, None), operator.scales, self.global_step)
+
+    def _hardest(self, stream: str, sample: Sample) -> Sample:
+        """The collocation points of the largest residuals, if only those count."""
+        share = self.objective.hardest
+        if stream != "interior" or share == 1:
+            return sample
+        with torch.no_grad():
+            field = self.operator.field(sample.points, sample.types)
+            view = self._view(sample, field, self.operator.field)
+            names = [name for name, term in self.terms.items() if term.stream == stream]
+            found = [self.objective.residual(name, view).abs().flatten(1).amax(-1) for name in names]
+        worst = torch.stack(found).amax(0)
+        return sample.rows(worst.topk(max(1, round(share * len(worst)))).indices)
+
+    def validation_step(self, sample: Sample, batch_idx: int) -> None:
+        """Weighted absolute percentage errors of values and costates on held-out labels."""
+        if sample.labels is None:
+            raise ValueError("Validation needs labelled rows; this sample has points only.")
+        field = self.operator.field(sample.points, sample.types)
+        self.value_error(field.value, sample.labels.value)
+        self.costate_error(field.costate.flatten(1), sample.labels.costate.flatten(1))
+        self.log_dict({"val/value_error": self.value_error, "val/costate_error": self.costate_error})
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Add the record."""
+        checkpoint.update(self.record())
+
+    def configure_optimizers(self) -> Any:
+        """What the `optimizer` argument builds."""
+        if self.optimizer is None:
+            raise ValueError("This module was built without an optimizer; pass one to train it.")
+        return self.optimizer(self.operator.parameters())
