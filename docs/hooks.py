@@ -1,4 +1,4 @@
-"""MkDocs hook: every notebook is a page. Markdown cells stay as they are, code cells become code blocks with their output."""
+"""MkDocs hook: every notebook is a page. Markdown cells stay; code cells become code blocks, with what they printed."""
 
 from __future__ import annotations
 
