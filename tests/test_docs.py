@@ -15,6 +15,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
+import torch
+from hno.cli.main import main
+
+from hno.games import make
+from hno.operators import Architecture, make_operator
+from hno.training.checkpoint import Provenance, record
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -56,7 +62,6 @@ class Shell:
         command = bin_folder / "hno"
         command.write_text(f"#!{sys.executable}\nfrom hno.cli.main import main\nraise SystemExit(main())\n")
         command.chmod(0o755)
-        (bin_folder / "python").symlink_to(sys.executable)
         self.environment = os.environ | {
             "PATH": f"{bin_folder}:{Path(sys.executable).parent}:{os.environ['PATH']}",
             "PYTHONPATH": f"{self.site}:{ROOT}",
@@ -110,6 +115,42 @@ def test_python_on_a_page_is_python(page: Path) -> None:
 def test_links_of_pages_outside_the_site_exist(page: Path) -> None:
     for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):
         assert (ROOT / target).exists(), target
+
+
+OWN = re.compile(r"=(crossing|values|parametric|adagrad)\b|\.(smooth|starts)\b|mine\.safetensors")
+"""What exists only after a reader has made it; other tests make it."""
+
+
+def commands() -> list[str]:
+    """Every command line on the pages that has a dry run."""
+    found = dict.fromkeys(
+        re.sub(r"^python (train|evaluate)\.py", r"hno \1", line)
+        for page in PAGES
+        for block in blocks(page)
+        if block.language in ("", "sh")
+        for line in block.text.splitlines()
+    )
+    known = [line for line in found if re.match(r"hno (train|evaluate|labels|report)\b", line)]
+    return [" ".join(map(shlex.quote, shlex.split(line, comments=True))) for line in known if not OWN.search(line)]
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A narrow-road operator with random weights, as training would have saved it."""
+    game, path = make("narrow_road"), tmp_path_factory.mktemp("run") / "best.ckpt"
+    kept = record(game, Architecture(), Provenance(types=[(1.0, 1.0)]))
+    torch.save({"state_dict": {f"operator.{n}": w for n, w in make_operator(game).state_dict().items()}, **kept}, path)
+    return path
+
+
+@pytest.mark.parametrize("line", sorted(set(commands())))
+def test_commands_on_the_pages_are_accepted(line: str, checkpoint: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Of a sweep, its first job."""
+    words = [word for word in shlex.split(line)[1:] if word != "-m"]
+    words = [re.sub(r"^checkpoint=.*", f"checkpoint={checkpoint}", word) for word in words]
+    words = [word if re.search(r"[\[;{]|^theta=", word) else re.sub(r"(?<==)([^,]+),.*", r"\1", word) for word in words]
+    code = main([*words, "--dry-run"])
+    assert code == 0, capsys.readouterr().err
 
 
 def follow(shell: Shell, *, everything: bool) -> None:
