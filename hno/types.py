@@ -134,7 +134,7 @@ class Extremal(NamedTuple):
     theta: Tensor
     """Player types, shape (B, P)."""
     clearance: Tensor
-    """Smallest -constraint over players and time, between the nodes too, m for distance constraints, shape (B,)."""
+    """Smallest -constraint over players, their constraints and time, between the nodes too, shape (B,)."""
     reintegration: Tensor
     """Distance between its end and where its controls lead, in widths of the PDE box, (B,)."""
     local_gap: Tensor
@@ -168,6 +168,11 @@ class Trajectory(NamedTuple):
     value: Tensor
     """Minus the cost of the whole episode, shape (B, P)."""
     clearance: Tensor
-    """Smallest -constraint over players and time, between the nodes too, shape (B,)."""
+    """Smallest -constraint over players, their constraints and time, between the nodes too, shape (B,)."""
     distance: Tensor
-    """Smallest distance between two players over time, m, shape (B,)."""
+    """Smallest distance between the positions of two players over time, m, inf for one player, shape (B,)."""
+
+    @property
+    def collided(self) -> Tensor:
+        """Which episodes collide, shape (B,): those that keep no positive clearance, NaN too."""
+        return ~(self.clearance > 0)

@@ -14,7 +14,7 @@ from hno.games import Box, Game
 class LinearQuadratic(Game):
     """x_i' = A_i x_i + B_i u_i with J_i = int x' Q_i x + u_i' R_i u_i dt + x(T)' S_i x(T), x the joint state.
 
-    The coupling x' Q_i x enters as the constraint under an identity penalty.
+    The coupling x' Q_i x is a state cost, without any constraint that could be violated.
 
     Args:
         drift: A, (P, n, n).
@@ -26,9 +26,6 @@ class LinearQuadratic(Game):
         label_step: s.
         reach: half width of the control box.
     """
-
-    penalty_height = 1.0
-    penalty_slope = 1.0
 
     def __init__(
         self,
@@ -61,14 +58,11 @@ class LinearQuadratic(Game):
     def terminal_value(self, x: Tensor) -> Tensor:
         return -quadratic(self.s, x)
 
-    def constraint(self, x: Tensor, theta: Tensor) -> Tensor:
+    def state_cost(self, x: Tensor, theta: Tensor) -> Tensor:
         return quadratic(self.q, x)
 
-    def penalty(self, constraint: Tensor) -> Tensor:
-        return constraint
-
-    def sensors(self, theta: Tensor) -> Tensor:
-        return theta.unsqueeze(-1)
+    def constraint(self, x: Tensor, theta: Tensor) -> Tensor:
+        return torch.full_like(x[..., :1], -10)
 
     def positions(self, x: Tensor) -> Tensor:
         return x[..., :2]

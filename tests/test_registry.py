@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import importlib
+import os
+import subprocess
 import sys
 from importlib.metadata import EntryPoint
+from pathlib import Path
 
 import pytest
 
-from hno.registry import Registry, UnknownNameError
+import hno
+from hno.cli.kinds import REGISTRIES
+from hno.registry import BrokenPluginWarning, Registry, UnknownNameError, check_options, options_of
 
 PACKAGE = """
 from hno.registry import Registry
@@ -30,8 +35,14 @@ class Lion:
 """
 PLUGIN = """
 class Axolotl:
-    pass
+    "A salamander that stays young."
 """
+GROUPS = {
+    "game": "hno.games",
+    "activation": "hno.activations",
+    "loss": "hno.losses",
+}
+"""The entry-point group of every kind."""
 NAMES = ("zoo_for_tests", "zoo_for_tests.savanna", "pond_for_tests")
 
 
@@ -130,8 +141,109 @@ def test_a_taken_name_is_refused(animals):
 
 def test_a_plugin_may_not_take_a_known_name(animals, installed):
     installed.install("lion", "Axolotl")
-    with pytest.raises(ValueError, match=r"animal name 'lion' is taken by zoo_for_tests.savanna.Lion"):
-        animals.names()
+    with pytest.warns(BrokenPluginWarning, match=r"animal name 'lion' is taken by zoo_for_tests.savanna.Lion"):
+        assert animals.names() == ["lion", "zebra"]
+    assert animals.get("lion").__name__ == "Lion"
+
+
+def test_what_cannot_be_loaded_is_named_and_stops_nothing_else(animals, installed, tmp_path):
+    broken = tmp_path / "zoo_for_tests" / "aviary.py"
+    broken.write_text("import nothing_of_that_name\n", encoding="utf-8")
+    (tmp_path / "zoo_for_tests" / "basin.py").write_text("def (:\n", encoding="utf-8")
+    installed.install("newt", "Newt")
+    installed.install("axolotl", "Axolotl")
+    with pytest.warns(BrokenPluginWarning) as caught:
+        assert animals.names() == ["axolotl", "lion", "zebra"]
+    assert len(caught) == 3
+    assert all("so its animal is missing" in str(warning.message) for warning in caught)
+    with pytest.raises(UnknownNameError) as error:
+        animals.get("newt")
+    said = str(error.value)
+    assert said.startswith("No animal named 'newt'. Known: axolotl, lion, zebra. Could not be loaded: ")
+    assert f"ModuleNotFoundError: No module named 'nothing_of_that_name' ({broken}:1)" in said
+    assert "zoo_for_tests.basin: SyntaxError" in said
+    assert "basin.py" in said
+    assert 'newt = "pond_for_tests:Newt"' in said
+
+
+def test_a_description_is_the_first_line_and_the_origin(animals, installed):
+    installed.install("axolotl", "Axolotl")
+    assert animals.describe("axolotl") == ("axolotl", "A salamander that stays young.", "pond_for_tests")
+    assert animals.describe("lion") == ("lion", "", "zoo_for_tests.savanna")
+
+
+def test_functions_are_registered_as_classes_are(animals):
+    @animals.register("hatched")
+    def hatch(eggs=3):
+        """A clutch."""
+
+    assert animals.get("hatched") is hatch
+    assert animals.describe("hatched").summary == "A clutch."
+    assert options_of(animals.get("hatched")) == {"eggs": 3}
+
+
+def test_unknown_options_are_answered_with_the_known_ones_and_the_nearest():
+    def hatch(nest, eggs=3, *others, warm=True, **more):
+        pass
+
+    assert options_of(hatch, skip=("nest",)) == {"eggs": 3, "warm": True}
+    check_options("clutch", hatch, {"eggs": 4}, skip=("nest",))
+    with pytest.raises(UnknownNameError) as caught:
+        check_options("clutch", hatch, {"egs": 4}, skip=("nest",))
+    assert str(caught.value) == "No option of clutch named 'egs'. Known: eggs, warm. Did you mean 'eggs'?"
+
+
+@pytest.mark.parametrize(
+    ("kind", "group"), [("game", "hno.games"), ("loss", "hno.losses"), ("activation", "hno.activations")]
+)
+def test_groups_of_entry_points_are_plurals(kind, group):
+    assert Registry(kind, "zoo_for_tests").group == group
+
+
+PROJECT = """
+[build-system]
+requires = ["setuptools"]
+build-backend = "setuptools.build_meta"
+
+[project]
+name = "menagerie"
+version = "0.3"
+
+[tool.setuptools]
+py-modules = ["menagerie"]
+"""
+MENAGERIE = """
+class {name}:
+    "One of another package."
+"""
+
+
+def test_every_group_takes_an_installed_package(tmp_path):
+    """One real package offers a class of every kind and is installed by pip; another interpreter looks them up."""
+    source, site = tmp_path / "source", tmp_path / "site"
+    source.mkdir()
+    points = [
+        f'[project.entry-points."{registry().group}"]\nforeign = "menagerie:{kind.title()}"'
+        for kind, registry in REGISTRIES.items()
+    ]
+    (source / "pyproject.toml").write_text(PROJECT + "\n".join(points), encoding="utf-8")
+    classes = [MENAGERIE.format(name=kind.title()) for kind in REGISTRIES]
+    (source / "menagerie.py").write_text("\n".join(classes), encoding="utf-8")
+    pip = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--no-index", "--no-build-isolation"]
+    subprocess.run([*pip, "--target", site, source], check=True, capture_output=True, text=True)
+    path = os.pathsep.join([str(site), str(Path(hno.__file__).parent.parent)])
+    code = (
+        "from hno.cli.kinds import REGISTRIES\n"
+        "for kind, registry in REGISTRIES.items():\n"
+        "    print(kind, *registry().describe('foreign'), registry().group, sep='|')"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines() == [
+        f"{kind}|foreign|One of another package.|menagerie 0.3|{group}" for kind, group in GROUPS.items()
+    ]
 
 
 def test_registering_a_class_twice_is_harmless(animals):

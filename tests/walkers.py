@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from hno.games import Box, ControlAffineGame
-from hno.games.kinematics import separation
+from hno.games.kinematics import distances
 
 
 @final
@@ -42,7 +42,7 @@ class Walkers(ControlAffineGame):
         return -10 * (x[..., 0] - self.width).square() - x[..., 1].square()
 
     def constraint(self, x: Tensor, theta: Tensor) -> Tensor:
-        return self.radius + 0.1 * theta.sum(-1, keepdim=True) - separation(self.positions(x))
+        return self.radius + 0.1 * theta.sum(-1)[..., None, None] - distances(self.positions(x))
 
     def sensors(self, theta: Tensor) -> Tensor:
         return torch.stack([theta, theta.flip(-1)], -1) / 4

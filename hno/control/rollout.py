@@ -44,7 +44,7 @@ def rollout(
         theta: player types, (B, P).
         dt: time for which a control is held, s.
         substeps: Runge-Kutta steps within `dt`.
-        points: states, interpolated within each of these, at which constraint and penalty are evaluated.
+        points: states, interpolated within each of these, at which constraints and running costs are evaluated.
         disturbance: of controls, motion and beliefs.
 
     Raises:
@@ -68,11 +68,11 @@ def rollout(
         for _ in range(substeps):
             after = runge_kutta(game, x, u, dt / substeps, push=None if push is None else push[:, k])
             inner = _between(x, after, points)
-            constraint = game.constraint(inner, theta.unsqueeze(1).expand(-1, points + 1, -1))
-            clearance = torch.minimum(clearance, -constraint.amax((-2, -1)))
+            types, held = theta.unsqueeze(1).expand(inner.shape[:-1]), u.unsqueeze(1).expand(-1, points + 1, -1, -1)
+            clearance = torch.minimum(clearance, -game.constraint(inner, types).amax((1, 2, 3)))
             distance = torch.minimum(distance, separation(game.positions(inner)).amin((-2, -1)))
-            penalty = torch.trapezoid(game.penalty(constraint), dx=1 / points, dim=1)
-            value = value - dt / substeps * (game.effort(u) + penalty)
+            cost = torch.trapezoid(game.running_cost(inner, held, types), dx=1 / points, dim=1)
+            value = value - dt / substeps * cost
             x = after
         path.append(x)
         controls.append(u)

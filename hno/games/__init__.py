@@ -4,7 +4,8 @@ import inspect
 import math
 from collections.abc import Sequence
 
-from hno.games.base import ControlAffineGame, Game, games
+from hno.games.affine import ControlAffineGame
+from hno.games.base import Game, games
 from hno.games.box import Box
 from hno.games.collision import CollisionAvoidance
 from hno.registry import UnknownNameError, unknown_name
@@ -17,7 +18,7 @@ def make(name: str, **constants: float | Sequence[float]) -> Game:
 
     Raises:
         UnknownNameError: no game has that name, or the game has no such constant.
-        ValueError: a constant is not a finite number, or a tuple of them; or the horizon is not positive.
+        ValueError: a constant is not a finite number, or a tuple of them; or one that must be positive is not.
     """
     cls = games.get(name)
     known = list(inspect.signature(cls).parameters)
@@ -28,7 +29,6 @@ def make(name: str, **constants: float | Sequence[float]) -> Game:
         if not all(isinstance(number, (int, float)) and math.isfinite(number) for number in numbers):
             raise ValueError(f"The constant {constant!r} of {name} must be finite; got {value!r}.")
     game = cls(**constants)
-    if not game.horizon > 0:
-        raise ValueError(f"The horizon of {name} must be positive, s; got {game.horizon}.")
+    game.check_constants()
     game.constants = dict(constants)
     return game

@@ -3,38 +3,60 @@
 from __future__ import annotations
 
 import abc
-import copy
-import hashlib
 import math
 import warnings
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
 from hno.games.box import Box
+from hno.games.final import FinalMethods
+from hno.games.fingerprint import fingerprint
 from hno.registry import Registry
 
 games: Registry[Game] = Registry("game", "hno.games")
+REQUIRED = ("horizon", "state_box", "initial_box", "control_box", "type_box")
+"""What every game sets, as attributes of its class or in its constructor."""
 
 
 class ExtrapolationWarning(UserWarning):
     """Player types outside the range that a game is made for."""
 
 
-class Game(nn.Module, abc.ABC):
+class Game(FinalMethods, nn.Module, abc.ABC):
     """A P-player general-sum differential game with state constraints, in reward form (players maximise V = -J).
 
     The dynamics are decoupled: `dynamics(x, u)[..., i, :]` depends on the state and control of player i alone. What
-    couples the players is the constraint, which enters every running cost as `penalty(constraint)` (paper, eq. 5).
+    couples the players is the running cost of states (paper, eq. 5), mostly the penalty of the constraints.
 
-    A subclass sets the attributes below and overrides the abstract methods; the other methods are shared and final.
-    Methods accept any leading batch shape and both float32 and float64.
+    A subclass sets the attributes below and overrides the abstract methods, and others where their docstrings say so;
+    the methods in `INSTEAD` are shared and final. Methods accept any leading batch shape B, the same for all their
+    arguments, and both float32 and float64. There are P players with n states, m controls and C constraints each.
     """
+
+    INSTEAD: ClassVar[Mapping[str, str]] = {
+        "running_cost": "effort, state_cost or penalty",
+        "uncontrolled_cost": "state_cost or penalty",
+        "hamiltonian": "dynamics, effort, state_cost or penalty",
+        "optimal_control": "best_response",
+        "violates": "constraint",
+        "validate_types": "type_box",
+        "check_theta": "type_box",
+        "check_constants": "positive",
+        "overrides": "the method in question",
+        "fingerprint": "the methods that it hashes",
+        "players": "roles",
+        "state_dim": "state_box",
+        "control_dim": "control_box",
+    }
 
     constants: Mapping[str, float | Sequence[float]] = MappingProxyType({})
     """Constructor arguments that differ from the defaults."""
+    positive: ClassVar[tuple[str, ...]] = ("horizon", "label_step", "penalty_height", "penalty_slope")
+    """Attributes that must be positive numbers; those of a subclass are added to those of its bases."""
     horizon: float
     """Length of the game, s."""
     label_step: float = 0.1
@@ -46,13 +68,25 @@ class Game(nn.Module, abc.ABC):
     initial_box: Box
     """Where episodes start, (P, n)."""
     control_box: Box
-    """Admissible controls of each player, (m,)."""
+    """Admissible controls, (m,), or (P, m) where players differ."""
     type_box: Box
     """Range of each player's type, (P,)."""
+    periodic: tuple[int, ...] = ()
+    """Places in a player's state that wrap, such as a heading; the edge of `state_box` is one period, 2 pi for an angle
+    in rad."""
     penalty_height: float = 1e4
     """Cost rate deep inside the violation set, 1/s."""
     penalty_slope: float = 5.0
-    """Steepness of the penalty, 1/m for distance constraints."""
+    """Steepness of the penalty, per unit of the constraint."""
+    constraint_unit: str = "m"
+    """Unit of the constraints, and so of the clearance; m says that they are distances."""
+
+    def __getattr__(self, name: str) -> Any:
+        """Name what a game has not set, also where one of its properties needs it."""
+        needed = {"state_dim": "state_box", "control_dim": "control_box"}.get(name, name)
+        if needed in REQUIRED and needed not in self.__dict__.get("_modules", {}):
+            raise AttributeError(f"{type(self).__name__} has no {needed}; every game sets {', '.join(REQUIRED)}")
+        return super().__getattr__(name)
 
     @abc.abstractmethod
     def dynamics(self, x: Tensor, u: Tensor) -> Tensor:
@@ -60,7 +94,7 @@ class Game(nn.Module, abc.ABC):
 
     @abc.abstractmethod
     def effort(self, u: Tensor) -> Tensor:
-        """Control part of the running cost, (B, P, m) -> (B, P)."""
+        """Control part of the running cost, 1/s, (B, P, m) -> (B, P)."""
 
     @abc.abstractmethod
     def terminal_value(self, x: Tensor) -> Tensor:
@@ -68,11 +102,10 @@ class Game(nn.Module, abc.ABC):
 
     @abc.abstractmethod
     def constraint(self, x: Tensor, theta: Tensor) -> Tensor:
-        """State constraint, at most 0 where safe, (B, P, n), (B, P) -> (B, P)."""
+        """State constraints of every player, below 0 where safe, (B, P, n), (B, P) -> (B, P, C) with C >= 1.
 
-    @abc.abstractmethod
-    def sensors(self, theta: Tensor) -> Tensor:
-        """Branch input: the indicator of the violation set on a lattice (paper, sec. III), (B, P) -> (B, P, S)."""
+        Players who keep distance have one constraint per other player: the largest of several has kinks.
+        """
 
     @abc.abstractmethod
     def best_response(self, x: Tensor, own_costate: Tensor) -> Tensor:
@@ -81,6 +114,45 @@ class Game(nn.Module, abc.ABC):
     @abc.abstractmethod
     def positions(self, x: Tensor) -> Tensor:
         """Where the players are in one common frame, m, (B, P, n) -> (B, P, 2 or 3); distances and pictures use it."""
+
+    def state_cost(self, x: Tensor, theta: Tensor) -> Tensor:
+        """Further running cost of states, such as tracking, 1/s, (B, P, n), (B, P) -> (B, P); none by default."""
+        return torch.zeros_like(x[..., 0])
+
+    def soft_constraint(self, constraint: Tensor) -> Tensor:
+        """Cost rate b sigmoid(gamma c) of a constraint (paper, eq. 5), 1/s, the same shape."""
+        return self.penalty_height * torch.sigmoid(self.penalty_slope * constraint)
+
+    def penalty(self, x: Tensor, theta: Tensor) -> Tensor:
+        """Sum of every player's soft constraints, 1/s, (B, P, n), (B, P) -> (B, P).
+
+        Override it where the penalty is no function of the constraints.
+        """
+        return self.soft_constraint(self.constraint(x, theta)).sum(-1)
+
+    def sensors(self, theta: Tensor) -> Tensor:
+        """Branch input of an operator, (B, P) -> (B, P, S): by default the own type and those of the others, scaled.
+
+        It must not change when other players of equal role swap, so the others are sorted. The paper's input is the
+        indicator of the violation set on a lattice (sec. III).
+        """
+        scaled, players = self.type_box.scale(theta), range(self.players)
+        others = torch.tensor([[j for j in players if j != i] for i in players], dtype=torch.long, device=theta.device)
+        return torch.cat([scaled.unsqueeze(-1), scaled[..., others].sort(descending=True).values], -1)
+
+    def default_types(self) -> list[tuple[float, ...]]:
+        """Types that labels are solved at by default, 3 P + 1 of them.
+
+        All players at the low end of their ranges, one at the high end, all at the high end, and a staircase of half
+        ranges from low to high.
+        """
+        players = range(self.players)
+        steps = [[0] * self.players, *([2 * (j == i) for j in players] for i in reversed(players)), [2] * self.players]
+        for level in (0, 1):
+            steps += [[level + (j >= i) for j in players] for i in reversed(players)]
+        lo, hi = self.type_box.lo.tolist(), self.type_box.hi.tolist()
+        types = [tuple(a + (b - a) * k / 2 for a, b, k in zip(lo, hi, step, strict=True)) for step in steps]
+        return list(dict.fromkeys(types))
 
     @property
     def players(self) -> int:
@@ -97,13 +169,13 @@ class Game(nn.Module, abc.ABC):
         """Number of controls per player m."""
         return self.control_box.lo.shape[-1]
 
-    def penalty(self, constraint: Tensor) -> Tensor:
-        """Soft constraint b sigmoid(gamma c) (paper, eq. 5), same shape as `constraint`."""
-        return self.penalty_height * torch.sigmoid(self.penalty_slope * constraint)
+    def uncontrolled_cost(self, x: Tensor, theta: Tensor) -> Tensor:
+        """The running cost without the effort, 1/s, (B, P)."""
+        return self.state_cost(x, theta) + self.penalty(x, theta)
 
     def running_cost(self, x: Tensor, u: Tensor, theta: Tensor) -> Tensor:
-        """Effort plus penalty, 1/s, (B, P)."""
-        return self.effort(u) + self.penalty(self.constraint(x, theta))
+        """Effort, state cost and penalty, 1/s, (B, P)."""
+        return self.effort(u) + self.uncontrolled_cost(x, theta)
 
     def hamiltonian(self, x: Tensor, costate: Tensor, u: Tensor, theta: Tensor) -> Tensor:
         """H_i = sum_j <dV_i/dx_j, f_j> - running cost of i, shape (B, P)."""
@@ -115,8 +187,8 @@ class Game(nn.Module, abc.ABC):
         return self.best_response(x, own_costate(costate))
 
     def violates(self, x: Tensor, theta: Tensor) -> Tensor:
-        """Whether any player's constraint is violated (or just met), shape (B,)."""
-        return (self.constraint(x, theta) >= 0).any(-1)
+        """Whether any constraint is violated (or just met), shape (B,)."""
+        return (self.constraint(x, theta) >= 0).flatten(-2).any(-1)
 
     def validate_types(self, types: Sequence[Sequence[float]]) -> list[tuple[float, ...]]:
         """Player types as tuples of floats, with an `ExtrapolationWarning` for those outside the type box.
@@ -147,60 +219,23 @@ class Game(nn.Module, abc.ABC):
             message = f"theta{given} lies outside the types {lo} to {hi} of the game: results extrapolate."
             warnings.warn(message, ExtrapolationWarning, stacklevel=3)
 
-    def fingerprint(self) -> str:
-        """Hash of the game's boxes and of its functions at fixed points: it changes when the physics does.
+    def check_constants(self) -> None:
+        """Refuse attributes that must be positive and are not.
 
-        It is taken on the CPU in float64, so that it is the same wherever the game is.
+        Raises:
+            ValueError: one of `positive` is not; the message names it.
         """
-        game = copy.deepcopy(self).cpu().double()
-        generator = torch.Generator().manual_seed(0)
-        boxes = [game.state_box, game.initial_box, game.control_box, game.type_box]
-        x, theta = game.state_box.sample(16, generator), game.type_box.sample(16, generator)
-        u = game.control_box.sample(16, generator).unsqueeze(-2).expand(-1, game.players, -1)
-        values = [corner for box in boxes for corner in (box.lo, box.hi)]
-        values += [game.dynamics(x, u), game.effort(u), game.terminal_value(x), game.constraint(x, theta)]
-        values += [game.sensors(theta), game.positions(x), game.penalty(torch.linspace(-2, 2, 9, dtype=x.dtype))]
-        digits = [f"{v:.4e}" for tensor in values for v in tensor.flatten().tolist()]
-        text = repr((type(self).__name__, self.horizon, self.label_step, self.roles, digits))
-        return hashlib.sha256(text.encode()).hexdigest()[:16]
+        for name in (name for base in type(self).__mro__ for name in vars(base).get("positive", ())):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{type(self).__name__} needs a positive {name}; got {getattr(self, name)}.")
 
+    def overrides(self, name: str) -> bool:
+        """Whether the game has a method of its own in the place of a default."""
+        return getattr(type(self), name) is not getattr(Game, name)
 
-class ControlAffineGame(Game):
-    """A game whose dynamics are drift(x) + G w(u) with effort sum_k r_k w_k^2, w an increasing map of each control.
-
-    The Hamiltonian is then a concave parabola in every w_k, so its maximiser on a box is the clamped vertex, exactly:
-    w = clamp(G' lambda_ii / 2r).
-    """
-
-    input_matrix: Tensor
-    """G, shape (n, m), a buffer."""
-    effort_weight: Tensor
-    """r, shape (m,), a buffer."""
-
-    @abc.abstractmethod
-    def drift(self, x: Tensor) -> Tensor:
-        """Dynamics at w = 0, (B, P, n) -> (B, P, n)."""
-
-    def affine_input(self, u: Tensor) -> Tensor:
-        """w(u), the input in which the dynamics are affine, (B, P, m) -> (B, P, m)."""
-        return u
-
-    def control_of(self, w: Tensor) -> Tensor:
-        """Inverse of `affine_input`."""
-        return w
-
-    def dynamics(self, x: Tensor, u: Tensor) -> Tensor:
-        """Time derivative of the state, (B, P, n)."""
-        return self.drift(x) + self.affine_input(u) @ self.input_matrix.mT
-
-    def effort(self, u: Tensor) -> Tensor:
-        """Weighted squares of the affine input, 1/s, (B, P)."""
-        return self.affine_input(u).square() @ self.effort_weight
-
-    def best_response(self, x: Tensor, own_costate: Tensor) -> Tensor:
-        """The clamped vertex of each player's Hamiltonian, (B, P, m)."""
-        vertex = own_costate @ self.input_matrix / (2 * self.effort_weight)
-        return self.control_of(vertex.clamp(*map(self.affine_input, (self.control_box.lo, self.control_box.hi))))
+    def fingerprint(self) -> str:
+        """Hash of the game's boxes and of its functions at fixed points: it changes when the physics does."""
+        return fingerprint(self)
 
 
 def _numbers(entries: object) -> tuple[float, ...]:

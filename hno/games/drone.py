@@ -26,6 +26,8 @@ class Drone(CollisionAvoidance):
         horizon: length of the game, s.
     """
 
+    positive = ("width",)
+
     def __init__(self, width: float = 5.0, radius: float = 0.5, horizon: float = 4.0) -> None:
         super().__init__()
         self.width, self.radius, self.horizon = width, radius, horizon

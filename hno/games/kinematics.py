@@ -26,14 +26,20 @@ def double_integrator_drift(x: Tensor) -> Tensor:
     return torch.cat([velocity, torch.zeros_like(velocity)], -1)
 
 
-def separation(positions: Tensor, softness: float = 1e-6) -> Tensor:
-    """Distance of each player to its nearest other player, m, inf for one alone, (..., P, d) -> (..., P).
+def distances(positions: Tensor, softness: float = 1e-6) -> Tensor:
+    """Distances of each player to the others, m, the next player first, (..., P, d) -> (..., P, P - 1).
 
     Args:
         positions: points in one common frame, m.
         softness: rounds the tip of the cone, m, so that every derivative is finite where players touch.
     """
-    nearest = torch.full_like(positions[..., 0], torch.inf)
-    for shift in range(1, positions.shape[-2]):
-        nearest = torch.minimum(nearest, (positions - positions.roll(shift, -2)).square().sum(-1))
-    return (nearest + softness**2).sqrt()
+    if positions.shape[-2] == 1:
+        return positions[..., :0]
+    gaps = [positions - positions.roll(-shift, -2) for shift in range(1, positions.shape[-2])]
+    return (torch.stack(gaps, -2).square().sum(-1) + softness**2).sqrt()
+
+
+def separation(positions: Tensor) -> Tensor:
+    """Distance of each player to its nearest other player, m, inf for one alone, (..., P, d) -> (..., P)."""
+    alone = torch.full_like(positions[..., :1], torch.inf)
+    return torch.cat([distances(positions), alone], -1).amin(-1)

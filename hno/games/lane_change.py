@@ -26,6 +26,7 @@ class LaneChange(CollisionAvoidance):
     """
 
     roles = (0, 1)
+    positive = ("speed",)
     lanes: Tensor
 
     def __init__(

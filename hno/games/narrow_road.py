@@ -26,6 +26,8 @@ class NarrowRoad(CollisionAvoidance):
         horizon: length of the game, s.
     """
 
+    positive = ("length", "speed")
+
     def __init__(
         self, length: float = 70.0, lane: float = 4.0, speed: float = 18.0, radius: float = 1.25, horizon: float = 3.0
     ) -> None:

@@ -32,13 +32,14 @@ class HJIResidual(LossTerm):
         return hji_residual(view.game, view.sample.points, view.field)
 
     def scale(self, view: View) -> Tensor:
-        """Size of values per horizon, plus the penalty at each point, (B, P).
+        """Size of values per horizon, plus the cost of the state at each point, (B, P).
 
-        Without the penalty, points deep inside the violation set, where it is thousands of times larger and where no
+        Without it, points deep inside the violation set, where it is thousands of times larger and where no
         equilibrium goes, would make up the whole loss.
         """
         points = view.sample.points
-        return view.scales.value / view.game.horizon + view.game.penalty(view.game.constraint(points.x, points.theta))
+        cost = view.game.uncontrolled_cost(points.x, points.theta)
+        return view.scales.value / view.game.horizon + cost.abs()
 
 
 @final

@@ -28,7 +28,7 @@ class Encoding(nn.Module):
         self.game = [game]  # a list: the operator owns the game, whose buffers must not be saved twice
         self.register_buffer("roles", torch.tensor(game.roles, dtype=game.state_box.lo.dtype), persistent=False)
         self.has_roles, self.several = len(set(game.roles)) > 1, game.players > 2
-        self.periodic = list(getattr(game, "periodic", ()))
+        self.periodic = list(game.periodic)
         self.features = game.state_dim + len(self.periodic)
         sensors = game.sensors((game.type_box.lo + game.type_box.hi) / 2).shape[-1]
         other = self.features + self.several * (self.has_roles + 1)

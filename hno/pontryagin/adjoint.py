@@ -21,13 +21,13 @@ def per_player_copies(x: Tensor) -> Tensor:
     return x.unsqueeze(-3).expand(*x.shape[:-2], players, players, x.shape[-1])
 
 
-def penalty_gradient(game: Game, x: Tensor, theta: Tensor, *, create_graph: bool = False) -> Tensor:
-    """Gradient of every player's penalty in every player's state, (B, P, n) -> (B, P, P, n)."""
+def cost_gradient(game: Game, x: Tensor, theta: Tensor, *, create_graph: bool = False) -> Tensor:
+    """Gradient of every player's running cost in every player's state at fixed control, (B, P, n) -> (B, P, P, n)."""
     with torch.enable_grad():
         copies = per_player_copies(x)
         copies = copies if copies.requires_grad else copies.detach().requires_grad_()
-        penalty = game.penalty(game.constraint(copies, theta.unsqueeze(-2).expand(copies.shape[:-1])))
-        return gradient_of(penalty.diagonal(dim1=-2, dim2=-1).sum(), copies, create_graph=create_graph)
+        cost = game.uncontrolled_cost(copies, theta.unsqueeze(-2).expand(copies.shape[:-1]))
+        return gradient_of(cost.diagonal(dim1=-2, dim2=-1).sum(), copies, create_graph=create_graph)
 
 
 def dynamics_jacobian(game: Game, x: Tensor, u: Tensor) -> Tensor:
@@ -65,7 +65,7 @@ def terminal_costate(game: Game, x: Tensor, *, create_graph: bool = False) -> Te
 
 
 def drift_rate(game: Game, x: Tensor, own: Tensor, *, create_graph: bool = False) -> tuple[Tensor, Tensor]:
-    """The part of `pmp_rate` without the penalty; that of player i depends on (x_i, own_i) alone.
+    """The part of `pmp_rate` without the running cost; that of player i depends on (x_i, own_i) alone.
 
     Returns:
         dx/dt and -(df_i/dx_i)' own_i at fixed control, each (B, P, n).
@@ -92,13 +92,13 @@ def pmp_rate(game: Game, x: Tensor, own: Tensor, theta: Tensor) -> tuple[Tensor,
         dx/dt and d(own)/dt = -dH_i/dx_i at fixed control, each (B, P, n).
     """
     flow, transport = drift_rate(game, x, own)
-    return flow.detach(), own_costate(penalty_gradient(game, x, theta)) + transport
+    return flow.detach(), own_costate(cost_gradient(game, x, theta)) + transport
 
 
 def pmp_rate_and_jacobian(game: Game, x: Tensor, own: Tensor, theta: Tensor) -> tuple[Tensor, Tensor]:
     """The rate of z = (x, own), flattened, and its derivative in z; arguments as for `pmp_rate`.
 
-    Only the penalty couples the players: the rest of the Jacobian is one block per player.
+    Only the running cost couples the players: the rest of the Jacobian is one block per player.
 
     Returns:
         (B, D) and (B, D, D) with D = 2 P n.
@@ -109,7 +109,7 @@ def pmp_rate_and_jacobian(game: Game, x: Tensor, own: Tensor, theta: Tensor) -> 
         drift = torch.cat(drift_rate(game, *both.split(states, -1), create_graph=True), -1)
         blocks = jacobian_rows(drift, both).movedim(0, -2).unflatten(-1, (2, states)).unflatten(-3, (2, states))
         flat = x.flatten(-2).detach().requires_grad_()
-        load = penalty_gradient(game, flat.unflatten(-1, (players, states)), theta, create_graph=True)
+        load = cost_gradient(game, flat.unflatten(-1, (players, states)), theta, create_graph=True)
         load = own_costate(load).flatten(-2)
         curvature = jacobian_rows(load, flat).movedim(0, -2)
     rate = torch.cat([part.flatten(-2) for part in drift.detach().split(states, -1)], -1)

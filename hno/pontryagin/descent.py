@@ -5,7 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from hno.pontryagin.held_controls import Expansion, HeldControls
+from hno.pontryagin.expansion import Expansion
+from hno.pontryagin.held_controls import HeldControls
 
 STEP_LENGTHS = (1.0, 0.5, 0.2, 0.05)
 """Step lengths in the order in which they are tried."""

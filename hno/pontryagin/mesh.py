@@ -24,9 +24,9 @@ def inner_times(labels: Tensor, points: int = 10) -> Tensor:
     return torch.lerp(labels[:-1, None], labels[1:, None], share)
 
 
-def encounter_weight(penalty: Tensor) -> Tensor:
-    """How much the players' penalties (B, L - 1, Q, P) vary within each label interval, plus a floor, (B, L - 1)."""
-    weight = penalty.sum(-1).diff(dim=-1).abs().sum(-1).nan_to_num(0, 0).clamp_min(1e-12).sqrt()
+def encounter_weight(cost: Tensor) -> Tensor:
+    """How much costs of states (B, L - 1, Q, P) vary within each label interval, plus a floor, (B, L - 1)."""
+    weight = cost.sum(-1).diff(dim=-1).abs().sum(-1).nan_to_num(0, 0).clamp_min(1e-12).sqrt()
     return weight / weight.amax(-1, keepdim=True) + 0.05
 
 

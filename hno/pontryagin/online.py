@@ -83,8 +83,8 @@ def remaining(game: Game, last: Iterate, extra: int) -> Iterate:
     equations, labels = Collocation(game), label_times(game, dtype=last.t.dtype, device=last.t.device)
     inner = inner_times(labels)
     x = equations.split(_ahead(game, last, inner.flatten()))[0].unflatten(1, inner.shape)
-    penalty = game.penalty(game.constraint(x, last.theta[:, None, None].expand(x.shape[:-1])))
-    t = graded_mesh(labels, encounter_weight(penalty), extra)
+    cost = game.uncontrolled_cost(x, last.theta[:, None, None].expand(x.shape[:-1]))
+    t = graded_mesh(labels, encounter_weight(cost), extra)
     return Iterate(t, _ahead(game, last, t), last.theta)
 
 

@@ -27,7 +27,7 @@ class Solver(NamedTuple):
     search: Search = Search()
     newton: Newton = Newton()
     extra_nodes: int = 60
-    """Mesh nodes beyond the label nodes, placed where the penalty acts."""
+    """Mesh nodes beyond the label nodes, placed where the cost of states varies."""
     reintegration: float = 1e-4
     """Largest re-integration error of a label, in widths of the PDE box."""
     chunk: int = 128
@@ -133,8 +133,9 @@ def _held(game: Game, labels: Tensor, x: Tensor, u: Tensor, t: Tensor) -> tuple[
 def _encounter_weight(game: Game, labels: Tensor, x: Tensor, u: Tensor, theta: Tensor) -> Tensor:
     """Where a trajectory of held controls needs nodes, (B, L - 1)."""
     since = inner_times(labels) - labels[:-1, None]
-    inner = runge_kutta(game, x[:, :-1, None], u[:, :, None], since[..., None, None])
-    return encounter_weight(game.penalty(game.constraint(inner, theta[:, None, None].expand(inner.shape[:-1]))))
+    inside = (-1, -1, since.shape[-1], -1, -1)
+    inner = runge_kutta(game, x[:, :-1, None].expand(inside), u[:, :, None].expand(inside), since[..., None, None])
+    return encounter_weight(game.uncontrolled_cost(inner, theta[:, None, None].expand(inner.shape[:-1])))
 
 
 class Along(NamedTuple):
@@ -189,7 +190,7 @@ def _describe(game: Game, found: OnMesh, settings: Solver) -> Extremal:
     costate = costates(game, at.t, *path, at.theta)
     value = values(game, at.t, *path, at.theta)
     everywhere = torch.cat([x, middle[0]], 1)
-    clearance = -game.constraint(everywhere, at.theta.unsqueeze(1).expand(everywhere.shape[:-1])).amax((1, 2))
+    clearance = -game.constraint(everywhere, at.theta.unsqueeze(1).expand(everywhere.shape[:-1])).amax((1, 2, 3))
     t = label_times(game, dtype=x.dtype, device=x.device)
     drift = reintegration_error(game, at)
     astray = (status == Status.CONVERGED) & (drift > settings.reintegration)

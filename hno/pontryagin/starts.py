@@ -66,7 +66,7 @@ def find_starts(game: Game, start: Tensor, theta: Tensor, search: Search) -> Sta
         x, v, cost = descend(guarded, start[rows], v, iterations, search.tolerance)
         best = _cheapest(x, cost, size)[1][:, :kept].flatten()
         rows, v, guarded = rows[best], v[best], guarded.rows(best)
-    exact = HeldControls(game, t, theta[rows], points=search.points)
+    exact = HeldControls(game, t, theta[rows], points=search.points, distinct=guarded.distinct)
     v = v.repeat_interleave(search.coarse, 1)[:, : exact.steps]
     x, v, cost = descend(exact, start[rows], v, search.fine_iterations, search.tolerance)
     cost, order = _cheapest(x, cost, size)

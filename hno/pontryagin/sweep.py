@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from hno.games import Game
-from hno.pontryagin.adjoint import dynamics_jacobian, penalty_gradient, terminal_costate
+from hno.pontryagin.adjoint import cost_gradient, dynamics_jacobian, terminal_costate
 
 
 def costates(game: Game, t: Tensor, x: Tensor, u: Tensor, middle: tuple[Tensor, Tensor], theta: Tensor) -> Tensor:
@@ -44,9 +44,9 @@ def costates(game: Game, t: Tensor, x: Tensor, u: Tensor, middle: tuple[Tensor, 
 
 
 def _adjoint_terms(game: Game, x: Tensor, u: Tensor, theta: Tensor) -> tuple[Tensor, Tensor]:
-    """A = (df_j/dx_j)' (B, K, P, n, n) and q = d penalty_i / dx_j (B, K, P, P, n) of the rate q - A l."""
+    """A = (df_j/dx_j)' (B, K, P, n, n) and q = d cost_i / dx_j (B, K, P, P, n) of the rate q - A l."""
     types = theta.unsqueeze(-2).expand(x.shape[:-1])
-    return dynamics_jacobian(game, x, u).mT, penalty_gradient(game, x, types)
+    return dynamics_jacobian(game, x, u).mT, cost_gradient(game, x, types)
 
 
 def values(game: Game, t: Tensor, x: Tensor, u: Tensor, middle: tuple[Tensor, Tensor], theta: Tensor) -> Tensor:

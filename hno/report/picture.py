@@ -37,7 +37,7 @@ def rollout_picture(game: Game, played: Trajectory, theta: Tensor, path: Path, t
     x, t = played.x[row], played.t
     places = game.positions(x)
     distance = separation(places).amin(-1)
-    allowed = game.constraint(x, theta[row].expand(len(t), -1)).amax(-1) + distance
+    allowed = game.constraint(x, theta[row].expand(len(t), -1)).amax((-2, -1)) + distance
     figure = Figure(figsize=(9, 5), layout="constrained")
     top, bottom = figure.subplots(2, 1, height_ratios=(3, 2))
     closest = int(distance.argmin())

@@ -13,9 +13,12 @@ import pytest
 import torch
 
 from hno.cli import evaluate, pages, starts, train
+from hno.cli.main import main
 from hno.data import datamodule
-from hno.games import make
-from hno.operators import operators
+from hno.games import Game, make
+from hno.operators import make_operator
+from hno.training.checkpoint import Provenance, record
+from tests.fakes import small_architecture
 
 SMOKE = ("experiment=smoke", "data.types=[[1,1]]", "data.workers=1", "evaluation.dt=0.1")
 """A run of seconds, on labels that every test shares."""
@@ -73,22 +76,15 @@ def command(
     clean_globals: None,
     no_pages: None,
 ) -> Command:
-    """Run train.py or evaluate.py in this process, as the command line would, but without pictures and pages."""
+    """Run a command in this process, as the command line would, but without pictures and pages."""
     monkeypatch.setattr(evaluate, "draw", lambda *arguments: None)
-    mains = {"train": train.main, "evaluate": evaluate.main}
 
-    def run(name: str, *overrides: str, folder: Path = tmp_path / "run") -> Outcome:
-        monkeypatch.setattr(sys, "argv", [f"{name}.py", *overrides, f"hydra.run.dir={folder}"])
+    def run(name: str, *words: str, folder: Path = tmp_path / "run") -> Outcome:
+        monkeypatch.setattr(sys, "argv", [name])
         capsys.readouterr()
-        code: int | str | None = 0
-        try:
-            mains[name]()
-        except SystemExit as stop:
-            code = stop.code
-        printed = "".join(capsys.readouterr())
-        if isinstance(code, str):
-            code, printed = 1, printed + code
-        return Outcome(code or 0, printed, folder)
+        to = [f"hydra.run.dir={folder}"] if name in ("train", "evaluate") else []
+        code = main([name, *words, *to])
+        return Outcome(code, "".join(capsys.readouterr()), folder)
 
     return run
 
@@ -118,12 +114,17 @@ def refused(run: Outcome, *fragments: str) -> None:
 @pytest.fixture
 def random_checkpoint(tmp_path: Path) -> Path:
     """A narrow-road operator with random weights, as training would have saved it."""
-    torch.manual_seed(0)
-    operator = operators.get("hno")(make("narrow_road"), width=16, depth=2)
-    operator.seen_types = [(1.0, 1.0)]
-    content: dict[str, Any] = {"state_dict": operator.state_dict()}
-    operator.on_save_checkpoint(content)
-    path = tmp_path / "random" / "last.ckpt"
+    return save_random(tmp_path / "random" / "last.ckpt")
+
+
+def save_random(path: Path, game: Game | None = None, method: str = "hno", seed: int = 0, also: float = 1.0) -> Path:
+    """An operator with random weights as training would have saved it, trained at (1, 1) and (also, also)."""
+    torch.manual_seed(seed)
+    game = game or make("narrow_road")
+    architecture = small_architecture("sin")
+    weights = make_operator(game, architecture).state_dict()
+    origin = Provenance(method, list(dict.fromkeys([(1.0, 1.0), (also, also)])), 0, "any")
     path.parent.mkdir()
-    torch.save(content, path)
+    content = {"state_dict": {f"operator.{name}": weight for name, weight in weights.items()}}
+    torch.save(content | record(game, architecture, origin), path)
     return path

@@ -17,9 +17,8 @@ from hno.evaluation import closed_loop
 from hno.evaluation.residuals import REGIONS
 from hno.games import Game, make
 from hno.games.base import ExtrapolationWarning
-from hno.operators import operators
 from hno.types import Trajectory
-from tests.cli.conftest import SMOKE, Command, refused
+from tests.cli.conftest import SMOKE, Command, refused, save_random
 
 FAST = ("workers=1", "starts=4", "dt=0.1")
 
@@ -39,6 +38,31 @@ def test_evaluation_of_a_trained_model_repeats_the_table_of_its_run(command: Com
     assert {path: path.read_bytes() for path in before} == before
 
 
+@pytest.mark.parametrize("words", [("{}",), ("checkpoint={}",), ("-m", "checkpoint={}")])
+def test_the_folder_of_a_run_is_a_checkpoint(
+    command: Command, random_checkpoint: Path, tmp_path: Path, words: tuple[str, ...]
+) -> None:
+    words = (*(word.format(random_checkpoint.parent) for word in words), f"hydra.sweep.dir={tmp_path}/sweep")
+    run = command("evaluate", *words, "theta=1,1", "residuals=false", *FAST)
+    assert run.code == 0, run.text
+    results = run if "-m" not in words else run._replace(folder=tmp_path / "sweep" / "0")
+    assert results.results["checkpoint"] == str(random_checkpoint)
+    assert "2 jobs" not in run.text
+
+
+def test_one_thread_unless_asked_otherwise(command: Command, random_checkpoint: Path) -> None:
+    before = torch.get_num_threads()
+    try:
+        arguments = (f"checkpoint={random_checkpoint}", "theta=1,1", "residuals=false", *FAST)
+        torch.set_num_threads(2)
+        command("evaluate", *arguments)
+        assert torch.get_num_threads() == 1
+        command("evaluate", *arguments, "threads=2")
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+
+
 def test_types_from_the_command_line(command: Command, random_checkpoint: Path) -> None:
     run = command("evaluate", f"checkpoint={random_checkpoint}", "theta=1,1;2.5,4.1", *FAST)
     assert run.code == 0, run.text
@@ -56,8 +80,7 @@ def test_named_grids_span_the_types_of_the_game(random_checkpoint: Path, name: s
 
 
 def test_default_types_are_the_seen_ones_and_four_unseen(random_checkpoint: Path) -> None:
-    unseen = OmegaConf.load(config_dir() / "evaluate.yaml").unseen
-    types = types_to_evaluate("default", hno.load_policy(random_checkpoint), unseen)
+    types = types_to_evaluate("default", hno.load_policy(random_checkpoint))
     assert types == [(1.0, 1.0), (1.0, 2.0), (2.0, 2.0), (2.0, 4.0), (4.0, 5.0)]
 
 
@@ -70,20 +93,20 @@ def test_types_outside_the_range_warn(random_checkpoint: Path) -> None:
 @pytest.mark.parametrize(
     ("theta", "message"),
     [
-        ("everything", "default, grid5, grid9"),
-        ("grid7", "grid5, grid9"),
+        ("everything", "default, corners, gridN"),
+        ("grid1", "corners, gridN"),
         ("1,1;2", "2 finite numbers"),
         ("1", "2 finite numbers"),
         ("1,1,1", "2 finite numbers"),
         ("1,nan", "2 finite numbers"),
         ("1,inf", "2 finite numbers"),
-        ("1,1;", "grid5, grid9"),
+        ("1,1;", "corners, gridN"),
     ],
 )
 def test_impossible_types(command: Command, random_checkpoint: Path, theta: str, message: str) -> None:
     run = command("evaluate", f"checkpoint={random_checkpoint}", f"theta={theta}", *FAST)
     refused(run, message)
-    assert run.results["status"] == "failed"
+    assert not run.folder.exists()
 
 
 @pytest.mark.usefixtures("no_labels")
@@ -102,7 +125,7 @@ def test_impossible_types(command: Command, random_checkpoint: Path, theta: str,
         ("start=5", "Did you mean 'starts'?"),
         ("checkpoint=/nowhere/last.ckpt", "There is no checkpoint at /nowhere/last.ckpt"),
         ("checkpoint=[/nowhere/last.ckpt]", "There is no checkpoint at /nowhere/last.ckpt"),
-        ("checkpoint=[]", "There is no checkpoint at []"),
+        ("checkpoint=[]", "checkpoint must be a checkpoint, the folder of a run, or a list of them"),
         ("residuals=yes please", "residuals must be true or false"),
         ("robustness=1", "robustness must be true or false"),
     ],
@@ -113,7 +136,7 @@ def test_impossible_settings(command: Command, random_checkpoint: Path, override
 
 @pytest.mark.usefixtures("no_labels")
 def test_without_a_checkpoint(command: Command) -> None:
-    refused(command("evaluate"), "checkpoint=<path")
+    refused(command("evaluate"), "checkpoint is missing: give it as checkpoint=<value>")
 
 
 @pytest.mark.usefixtures("no_labels")
@@ -123,7 +146,7 @@ def test_truncated_checkpoint(command: Command, random_checkpoint: Path, kept: f
     random_checkpoint.write_bytes(content[: int(kept * len(content))])
     run = command("evaluate", f"checkpoint={random_checkpoint}")
     refused(run, "not a readable checkpoint")
-    assert run.results["reason"].startswith("CheckpointError")
+    assert not run.folder.exists()
 
 
 @pytest.mark.usefixtures("no_labels")
@@ -137,7 +160,7 @@ def test_without_a_safe_start_the_rate_is_not_applicable(command: Command, rando
     assert run.code == 0, run.text
     assert run.results["table"][0]["rate"] is None
     assert "n/a" in run.text
-    assert "No rate (n/a) at (1, 1): of 4 starts none has an equilibrium that keeps 5000 cm" in run.text
+    assert "No rate (n/a) at (1, 1): of 4 starts none has an equilibrium that keeps 50 m" in run.text
 
 
 def test_without_a_safe_start_every_section_says_so(command: Command, random_checkpoint: Path) -> None:
@@ -153,15 +176,8 @@ def test_without_a_safe_start_every_section_says_so(command: Command, random_che
 
 def other(checkpoint: Path, folder: Path, game: str = "narrow_road", seed: int = 1, **constants: float) -> Path:
     """Another operator with random weights."""
-    torch.manual_seed(seed)
-    operator = operators.get("sno")(make(game, **constants), width=16, depth=2)
-    operator.seen_types = [(1.0, 1.0), (5.0, 5.0)]
-    content: dict[str, object] = {"state_dict": operator.state_dict()}
-    operator.on_save_checkpoint(content)
     path = checkpoint.parent.parent / folder / "last.ckpt"
-    path.parent.mkdir()
-    torch.save(content, path)
-    return path
+    return save_random(path, make(game, **constants), "sno", seed, also=5.0)
 
 
 def test_results_hold_the_configuration(command: Command, random_checkpoint: Path) -> None:
@@ -186,17 +202,18 @@ def test_residuals_are_a_section_that_can_be_switched_off(command: Command, rand
 
 def test_robustness_is_a_section_on_request(command: Command, random_checkpoint: Path) -> None:
     arguments = (f"checkpoint={random_checkpoint}", "theta=1,1;2,2", "residuals=false", *FAST)
-    asked = (*arguments, "robustness=true", "+conditions.heading={drift: 0.1, components: [2]}")
+    asked = (*arguments, "robustness=true", "conditions.heading={drift: 0.1, components: [2]}")
     run = command("evaluate", *asked)
     assert run.code == 0, run.text
     rows = {row["name"]: row for row in run.results["robustness"]}
     assert list(rows) == [*OmegaConf.load(config_dir() / "evaluate.yaml").conditions, "heading"]
-    assert rows["heading"]["disturbance"] == {"drift": 0.1, "components": [2]}
+    assert rows["heading"]["condition"] == {"drift": 0.1, "components": [2]}
     plain, table = rows["nominal"], run.results["table"]
     for name in ("safe_starts", "collisions"):
         assert plain[name] == sum(row[name] for row in table)
         assert [entry[name] for entry in plain["types"]] == [row[name] for row in table]
-    assert rows["belief"]["disturbance"] == {"belief": 0.5}
+    assert rows["belief"]["condition"] == {"belief": 0.5}
+    assert rows["symmetric"]["condition"] == {"symmetric": True}
     assert rows["widened"]["median_label_cost"] != plain["median_label_cost"]
     costs = [row["median_excess_cost"] for row in rows.values()]
     assert len(set(costs)) == len(costs), "every condition changes something"
@@ -210,8 +227,6 @@ def test_robustness_is_a_section_on_request(command: Command, random_checkpoint:
 def test_impossible_conditions(command: Command, random_checkpoint: Path) -> None:
     arguments = (f"checkpoint={random_checkpoint}", "robustness=true", *FAST)
     refused(command("evaluate", *arguments, "+conditions.delay.noisy=1"), "No condition entry named 'noisy'", "'noise'")
-    refused(command("evaluate", *arguments, "conditions={storm: {drift: 0.1}}"), "write +conditions.storm={...}")
-    refused(command("evaluate", *arguments, "conditions.delay.drift=1"), "write +conditions.delay.drift=<value>")
     refused(command("evaluate", *arguments, "+conditions.gusts.components=[7]"), "places in a player's state, 0 to 3")
 
 
@@ -238,7 +253,7 @@ def test_models_are_compared_on_the_same_starts(command: Command, random_checkpo
     for name in ("starts", "both", "only_reference", "only_other"):
         assert compared[name] == sum(pair[name] for pair in compared["types"])
     assert "random/last.ckpt" in run.text
-    assert "against random/last.ckpt" in run.text
+    assert "compared against random/last.ckpt" in run.text
 
 
 def test_every_model_meets_the_same_safe_starts(
@@ -279,7 +294,7 @@ def test_models_of_different_games_are_refused(command: Command, random_checkpoi
     wide = other(random_checkpoint, Path("wide"), radius=1.5)
     run = command("evaluate", f"checkpoint=[{random_checkpoint},{drone}]", *FAST)
     refused(run, "Models of different games", "NarrowRoad()", f"{drone} plays Drone()", "Evaluate them one by one")
-    assert run.results["status"] == "failed"
+    assert not run.folder.exists()
     refused(command("evaluate", f"checkpoint=[{random_checkpoint},{wide}]", *FAST), "NarrowRoad(radius=1.5)")
 
 

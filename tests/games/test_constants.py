@@ -60,12 +60,12 @@ def states(game) -> Tensor:
 
 def test_radii_at_the_types_that_the_facts_name(name, game, states):
     theta = torch.tensor([[1.0, 1.0], [1.0, 5.0], [5.0, 5.0]], dtype=torch.float64)
-    found = game.constraint(states[:3], theta)[:, 0] + distance(name, states[:3])
+    found = game.constraint(states[:3], theta)[:, 0, 0] + distance(name, states[:3])
     assert (found - BASE_RADIUS[name] + 1.25).tolist() == pytest.approx([1.5, 1.9, 2.5])
 
 
 def test_constraint_is_radius_minus_distance_at_every_type(name, game, states):
-    expected = (radius(name, TYPES) - distance(name, states)).unsqueeze(-1).expand(-1, 2)
+    expected = (radius(name, TYPES) - distance(name, states))[:, None, None].expand(-1, 2, 1)
     torch.testing.assert_close(game.constraint(states, TYPES), expected, rtol=0, atol=1e-9)
 
 
@@ -80,11 +80,11 @@ def test_the_radius_of_a_row_is_that_of_its_own_types(game, states):
 def test_penalty_is_the_sigmoid_of_the_paper(name, game, states):
     exponent = -5 * (radius(name, TYPES) - distance(name, states))
     expected = (1e4 / (1 + exponent.exp())).unsqueeze(-1).expand(-1, 2)
-    torch.testing.assert_close(game.penalty(game.constraint(states, TYPES)), expected, rtol=1e-7, atol=1e-12)
+    torch.testing.assert_close(game.penalty(states, TYPES), expected, rtol=1e-7, atol=1e-12)
 
 
 def test_penalty_at_the_radius_and_a_metre_outside(game):
-    at = game.penalty(torch.tensor([0.0, -1.06], dtype=torch.float64))
+    at = game.soft_constraint(torch.tensor([0.0, -1.06], dtype=torch.float64))
     assert at.tolist() == pytest.approx([5000, 49.7], abs=0.1)
 
 

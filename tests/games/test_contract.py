@@ -6,8 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from hno.games import Box, ControlAffineGame, make
-from hno.games.kinematics import double_integrator_drift, separation
+from hno.games import Box, ControlAffineGame, Game, make
+from hno.games.kinematics import distances, double_integrator_drift
 from hno.games.testing import ContractError, check_game
 from tests.lq import random_game
 
@@ -35,10 +35,33 @@ class Encounter(ControlAffineGame):
         return -x.square().sum(-1)
 
     def constraint(self, x: Tensor, theta: Tensor) -> Tensor:
-        return 0.1 * theta.sum(-1, keepdim=True) - separation(self.positions(x))
+        return 0.1 * theta.sum(-1)[..., None, None] - distances(self.positions(x))
 
     def sensors(self, theta: Tensor) -> Tensor:
         return theta.unsqueeze(-1).expand(*theta.shape, 3) / 5
+
+
+class FreeEncounter(Game):
+    """The same game, whose effort and best response are not derived."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        game = Encounter()
+        self.horizon, self.label_step = game.horizon, game.label_step
+        self.state_box, self.initial_box = game.state_box, game.initial_box
+        self.control_box, self.type_box = game.control_box, game.type_box
+        self.register_buffer("weight", game.effort_weight)
+
+    positions, terminal_value, constraint = Encounter.positions, Encounter.terminal_value, Encounter.constraint
+
+    def dynamics(self, x: Tensor, u: Tensor) -> Tensor:
+        return torch.cat([x[..., 2:], u], -1)
+
+    def effort(self, u: Tensor) -> Tensor:
+        return (self.weight * u.square()).sum(-1)
+
+    def best_response(self, x: Tensor, own_costate: Tensor) -> Tensor:
+        return self.control_box.clamp(own_costate[..., 2:] / (2 * self.weight))
 
 
 class CoupledDynamics(Encounter):
@@ -46,12 +69,12 @@ class CoupledDynamics(Encounter):
         return super().drift(x) + 0.01 * x.flip(-2)
 
 
-class CoupledEffort(Encounter):
+class CoupledEffort(FreeEncounter):
     def effort(self, u: Tensor) -> Tensor:
         return super().effort(u) + 0.1 * u.square().sum((-2, -1)).unsqueeze(-1)
 
 
-class CoupledResponse(Encounter):
+class CoupledResponse(FreeEncounter):
     def best_response(self, x: Tensor, own_costate: Tensor) -> Tensor:
         return super().best_response(x, own_costate.mean(-2, keepdim=True).expand_as(own_costate))
 
@@ -75,7 +98,7 @@ class DifferentBoxes(Encounter):
 class BareNorm(Encounter):
     def constraint(self, x: Tensor, theta: Tensor) -> Tensor:
         distance = self.positions(x).diff(dim=-2).square().sum(-1).sqrt()
-        return 0.1 * theta.sum(-1, keepdim=True) - distance.expand_as(theta)
+        return 0.1 * theta.sum(-1)[..., None, None] - distance.unsqueeze(-1).expand(*theta.shape, 1)
 
 
 class MirroredBareNorm(Encounter):
@@ -84,7 +107,7 @@ class MirroredBareNorm(Encounter):
 
     def constraint(self, x: Tensor, theta: Tensor) -> Tensor:
         distance = self.positions(x).diff(dim=-2).square().sum(-1).sqrt()
-        return 0.1 * theta.sum(-1, keepdim=True) - distance.expand_as(theta)
+        return 0.1 * theta.sum(-1)[..., None, None] - distance.unsqueeze(-1).expand(*theta.shape, 1)
 
 
 class KinkedTerminal(Encounter):
@@ -92,24 +115,24 @@ class KinkedTerminal(Encounter):
         return -x.abs().pow(1.5).sum(-1)
 
 
-class TwiceTheVertex(Encounter):
+class TwiceTheVertex(FreeEncounter):
     def best_response(self, x: Tensor, own_costate: Tensor) -> Tensor:
         return super().best_response(x, 2 * own_costate)
 
 
-class SlightlyOff(Encounter):
+class SlightlyOff(FreeEncounter):
     def best_response(self, x: Tensor, own_costate: Tensor) -> Tensor:
         return super().best_response(x, 1.02 * own_costate)
 
 
-class Minimiser(Encounter):
+class Minimiser(FreeEncounter):
     def best_response(self, x: Tensor, own_costate: Tensor) -> Tensor:
         return super().best_response(x, -own_costate)
 
 
-class Unclamped(Encounter):
+class Unclamped(FreeEncounter):
     def best_response(self, x: Tensor, own_costate: Tensor) -> Tensor:
-        return own_costate @ self.input_matrix / (2 * self.effort_weight)
+        return own_costate[..., 2:] / (2 * self.weight)
 
 
 class FixedBatch(Encounter):
@@ -117,7 +140,7 @@ class FixedBatch(Encounter):
         return -torch.stack([x[:, 0, 0], x[:, 1, 0]], -1)
 
 
-class OtherShape(Encounter):
+class OtherShape(FreeEncounter):
     def effort(self, u: Tensor) -> Tensor:
         return super().effort(u).unsqueeze(-1)
 
@@ -151,9 +174,48 @@ class RewardedViolation(Encounter):
     penalty_height = -1e4
 
 
-class OwnIdeaOfViolation(Encounter):
-    def violates(self, x: Tensor, theta: Tensor) -> Tensor:
-        return (self.constraint(x, theta) >= 0.5).any(-1)
+class TurnedSign(Encounter):
+    def constraint(self, x: Tensor, theta: Tensor) -> Tensor:
+        return -super().constraint(x, theta)
+
+
+class CostForReward(Encounter):
+    def terminal_value(self, x: Tensor) -> Tensor:
+        return -super().terminal_value(x)
+
+
+class RewardForCost(Encounter):
+    def state_cost(self, x: Tensor, theta: Tensor) -> Tensor:
+        return -x.square().sum(-1)
+
+
+class ReversedPenalty(Encounter):
+    def penalty(self, x: Tensor, theta: Tensor) -> Tensor:
+        return 1e4 - super().penalty(x, theta)
+
+
+class NoStateBox(Encounter):
+    def __init__(self) -> None:
+        super().__init__()
+        del self.state_box
+
+
+class NoSuchState(Encounter):
+    periodic = (4,)
+
+
+class NotPeriodic(Encounter):
+    periodic = (0,)
+
+
+class NegativeRadius(Encounter):
+    positive = ("radius",)
+    radius = -1.0
+
+
+class OwnSoftConstraint(Encounter):
+    def soft_constraint(self, constraint: Tensor) -> Tensor:
+        return -constraint
 
 
 class Drifting(Encounter):
@@ -198,6 +260,10 @@ def test_a_game_with_a_custom_penalty_keeps_the_contract(players):
     check_game(random_game(players))
 
 
+def test_a_game_whose_best_response_is_its_own_keeps_the_contract():
+    check_game(FreeEncounter())
+
+
 def test_a_plain_game_keeps_the_contract_and_is_left_alone():
     game = Encounter()
     check_game(game)
@@ -208,13 +274,16 @@ def test_a_plain_game_keeps_the_contract_and_is_left_alone():
 @pytest.mark.parametrize(
     ("broken", "message"),
     [
-        (CoupledDynamics, r"dynamics of each player that depends on its own .*Couple the players through `constraint`"),
+        (
+            CoupledDynamics,
+            r"dynamics of each player that depends on its own .*outside .* adjoints .*joint cost",
+        ),
         (CoupledEffort, r"effort of each player that depends on its own .*Couple the players through `constraint`"),
         (CoupledResponse, r"best_response of each player that depends on its own .*Couple the players through"),
         (DifferentTargets, r"terminal_value to swap .*declare roles = \(0, 1\)"),
         (DifferentSensors, r"sensors to swap .*declare roles = \(0, 1\)"),
         (DifferentBoxes, r"state_box to swap .*declare roles = \(0, 1\)"),
-        (BareNorm, r"finite first derivatives of constraint where the players' positions coincide; .*separation"),
+        (BareNorm, r"finite first derivatives of constraint where the players' positions coincide; .*distances"),
         (MirroredBareNorm, r"finite first derivatives of constraint where the players' positions coincide; "),
         (KinkedTerminal, r"finite second derivatives of terminal_value at the centres of the boxes"),
         (TwiceTheVertex, r"no other control in control_box raises; got a gain of .*exact maximiser"),
@@ -228,8 +297,16 @@ def test_a_plain_game_keeps_the_contract_and_is_left_alone():
         (InfiniteCost, r"finite terminal_value in state_box; got .*nan"),
         (NoSensors, r"sensors of shape \(2, 1\); got \(2, 0\)"),
         (OnALine, r"positions of shape \(2, 2\); got \(2, 1\)"),
-        (RewardedViolation, r"a penalty that grows with the constraint; .*Safe is a constraint below 0"),
-        (OwnIdeaOfViolation, r"violates where a constraint is at least 0; got a disagreement"),
+        (RewardedViolation, r"positive constants; got: RewardedViolation needs a positive penalty_height; got -10000"),
+        (NegativeRadius, r"positive constants; got: NegativeRadius needs a positive radius; got -1"),
+        (OwnSoftConstraint, r"a soft_constraint that grows with the constraint; .*Safe is a constraint below 0"),
+        (ReversedPenalty, r"a penalty that is larger where constraints are violated; got .*Mind signs"),
+        (TurnedSign, r"an initial_box where players are mostly safe; got .*turn its sign"),
+        (CostForReward, r"a terminal_value that is a reward; .*V = -J"),
+        (RewardForCost, r"a state_cost that is a cost; .*V = -J"),
+        (NoStateBox, r"an attribute state_box; got none.*constructor"),
+        (NoSuchState, r"places 0 to 3 in `periodic`; got \(4,\)"),
+        (NotPeriodic, r"repeats after one edge of state_box along the periodic state 0; .*2 pi"),
         (Drifting, r"one fingerprint for one game; .*pure functions"),
         (OutsideStart, r"initial_box inside state_box; got .*-5.0.*Widen state_box"),
         (OddHorizon, r"a whole multiple of label_step; got horizon 2.1 s, label_step 0.25 s"),

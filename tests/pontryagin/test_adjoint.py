@@ -8,8 +8,8 @@ from torch import Tensor
 
 from hno.games.base import own_costate
 from hno.pontryagin.adjoint import (
+    cost_gradient,
     dynamics_jacobian,
-    penalty_gradient,
     pmp_rate,
     pmp_rate_and_jacobian,
     terminal_costate,
@@ -30,7 +30,7 @@ def random_costate(x: Tensor, scale: float) -> Tensor:
 
 def test_the_penalty_acts_in_these_states(setting):
     game, x, theta = setting
-    penalty = game.penalty(game.constraint(x, theta))
+    penalty = game.penalty(x, theta)
     assert penalty.min() > 1
     assert penalty.max() < 9999
     assert penalty.max() > 2 * penalty.min()
@@ -62,18 +62,18 @@ def test_the_state_moves_as_the_costate_derivative_of_the_hamiltonian(setting):
     torch.testing.assert_close(pmp_rate(game, x, base, theta)[0], slope, rtol=1e-6, atol=1e-6)
 
 
-def test_penalty_gradient_of_every_player_in_every_state(setting):
+def test_cost_gradient_of_every_player_in_every_state(setting):
     game, x, theta = setting
-    slope = central_difference(lambda at: game.penalty(game.constraint(at, theta)), x)
+    slope = central_difference(lambda at: game.penalty(at, theta), x)
     assert slope.abs().amax((0, -1)).min() > 1
-    torch.testing.assert_close(penalty_gradient(game, x, theta), slope, rtol=1e-6, atol=1e-6 * float(slope.abs().max()))
+    torch.testing.assert_close(cost_gradient(game, x, theta), slope, rtol=1e-6, atol=1e-6 * float(slope.abs().max()))
 
 
-def test_penalty_gradient_tells_players_with_different_costs_apart():
+def test_cost_gradient_tells_players_with_different_costs_apart():
     game = random_game(3)
     x = game.state_box.sample(5, torch.Generator().manual_seed(0))
     exact = torch.einsum("pab,rb->rpa", 2 * game.q, x.flatten(-2)).unflatten(-1, x.shape[-2:])
-    torch.testing.assert_close(penalty_gradient(game, x, x[..., 0]), exact)
+    torch.testing.assert_close(cost_gradient(game, x, x[..., 0]), exact)
 
 
 def test_terminal_costate_includes_the_other_players_states():

@@ -175,7 +175,7 @@ class Pillar(ControlAffineGame):
         return -10 * (x[..., 0] - 4).square() - x[..., 1].square()
 
     def constraint(self, x: Tensor, theta: Tensor) -> Tensor:
-        return 0.5 - (x - torch.stack([torch.full_like(theta, 2.0), theta], -1)).norm(dim=-1)
+        return 0.5 - (x - torch.stack([torch.full_like(theta, 2.0), theta], -1)).norm(dim=-1, keepdim=True)
 
     def sensors(self, theta: Tensor) -> Tensor:
         return theta.unsqueeze(-1)

@@ -111,7 +111,7 @@ def test_the_hamiltonian_of_the_shared_problem_is_conserved(name):
     found = solve(game, starts(game, 2), types(2, 1, 5), Solver(extra_nodes=120))
     game = game.double()
     assert found.status.tolist() == [Status.CONVERGED] * 2
-    penalty = game.penalty(game.constraint(found.x, along(found.theta, found.x)))[..., 0]
+    penalty = game.penalty(found.x, along(found.theta, found.x))[..., 0]
     flow = (own_costate(found.costate) * game.dynamics(found.x, found.u)).sum((-2, -1))
     energy = flow - game.effort(found.u).sum(-1) - penalty
     assert (energy.amax(1) - energy.amin(1)).max() < 2e-4 * penalty.max().clamp_min(1000)
@@ -157,6 +157,6 @@ def test_the_kept_start_has_the_largest_sum_of_values():
 
 def test_clearance_is_at_most_that_of_the_label_nodes():
     game, found = solved("lane_change")
-    at_nodes = -game.constraint(found.x, along(found.theta, found.x)).amax((1, 2))
+    at_nodes = -game.constraint(found.x, along(found.theta, found.x)).amax((1, 2, 3))
     assert (found.clearance <= at_nodes).all()
     assert (found.clearance > at_nodes - 0.5).all()

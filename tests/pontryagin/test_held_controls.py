@@ -10,7 +10,8 @@ from torch import Tensor
 
 from hno.games import make
 from hno.pontryagin.descent import descend
-from hno.pontryagin.held_controls import Expansion, HeldControls
+from hno.pontryagin.expansion import Expansion
+from hno.pontryagin.held_controls import HeldControls
 from hno.pontryagin.integrate import runge_kutta
 from tests.pontryagin.encounters import NAMES, encounters, types
 

@@ -50,7 +50,7 @@ class Brake(ControlAffineGame):
         return 2 * self.slope * x[..., 0] + 2 * (1 - self.slope * (1 - self.leaves)) * x[..., 1]
 
     def constraint(self, x: Tensor, theta: Tensor) -> Tensor:
-        return torch.full_like(theta, -20.0)
+        return torch.full_like(x[..., :1], -20.0)
 
     def sensors(self, theta: Tensor) -> Tensor:
         return theta.unsqueeze(-1)
