@@ -31,8 +31,8 @@ from hno.cli.config import config_dir, register_plugins
 from hno.cli.results import Results, config_hash
 from hno.cli.train import fit
 from hno.control.rollout import rollout
+from hno.data.certificates import safe
 from hno.data.labels import Request, default_cache, safe_labels_for
-from hno.data.trust import safe
 from hno.evaluation.metrics import clopper_pearson
 from hno.games import make
 from hno.training.checkpoint import OperatorPolicy, load_policy

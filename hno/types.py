@@ -171,3 +171,8 @@ class Trajectory(NamedTuple):
     """Smallest -constraint over players, their constraints and time, between the nodes too, shape (B,)."""
     distance: Tensor
     """Smallest distance between the positions of two players over time, m, inf for one player, shape (B,)."""
+
+    @property
+    def collided(self) -> Tensor:
+        """Which episodes collide, shape (B,): those that keep no positive clearance, NaN too."""
+        return ~(self.clearance > 0)

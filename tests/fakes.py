@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from hno.games import Game
+from hno.operators import Architecture, Choice
 from hno.pontryagin.mesh import label_times
 from hno.pontryagin.solve import Solver
 from hno.types import Extremal, Status, join
@@ -66,3 +67,14 @@ def fake_solve(game: Game, x0: Tensor, theta: Tensor, settings: Solver = Solver(
     seeds = [int.from_bytes(hashlib.sha256(start.numpy().tobytes()).digest()[:4]) for start in x0]
     rows = zip(theta.tolist(), seeds, x0, strict=True)
     return join([fake_labels(game, types, 1, seed, start=start) for types, seed, start in rows])
+
+
+def small_architecture(
+    activation: str = "tanh", width: int = 16, depth: int = 2, exact_terminal: bool = True, members: int = 1
+) -> Architecture:
+    """What a small operator is built of."""
+    return Architecture(
+        Choice("gradient", {"exact_terminal": exact_terminal, "members": members}),
+        Choice("deeponet", {"width": width, "depth": depth}),
+        Choice(activation),
+    )

@@ -11,13 +11,13 @@ from omegaconf import DictConfig
 from hno.cli.checkpoints import resumed
 from hno.cli.config import read
 from hno.cli.evaluate import check_evaluation, unseen_types
-from hno.cli.ntk import check_rows
 from hno.cli.results import plain
 from hno.cli.schema import GameSettings, TrainSettings
 from hno.cli.starts import cache_folder
 from hno.data import Collocation, GameData, LabelPlan, make_sampler
 from hno.data.curriculum import Curriculum
 from hno.data.labels import Report
+from hno.evaluation.kernels import check_rows
 from hno.games import Game, make
 from hno.games.grid import parse_types
 from hno.losses import Objective, make_objective
@@ -43,7 +43,7 @@ def check(config: DictConfig) -> TrainSettings:
         build_data(settings, game, streams(objective, operator))
         make_optimizer(steps=settings.trainer.max_steps, **settings.optimizer)
         if settings.evaluation.ntk:
-            check_rows(operator, settings.evaluation)
+            check_rows(operator, settings.evaluation.ntk_rows)
     if settings.resume is not None:
         resumed(settings.resume)
     return settings

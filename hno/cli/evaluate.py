@@ -7,12 +7,11 @@ import time
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, OmegaConf
-from torch import Tensor
+from omegaconf import DictConfig
 
 from hno.cli import launch
 from hno.cli.arguments import Arguments
@@ -21,20 +20,24 @@ from hno.cli.config import read
 from hno.cli.logs import send_lightning_to_hydra, use_threads
 from hno.cli.results import Results, config_hash, plain, write_json
 from hno.cli.schema import Episodes, EvaluateSettings
-from hno.cli.sections import check_sections, run_sections
-from hno.cli.starts import cache_folder, solve_starts
+from hno.cli.sections import check_sections, evaluation_of, run_sections, table_condition
+from hno.cli.starts import TestLabels, cache_folder
 from hno.cli.summary import report, show
-from hno.control.rollout import Disturbance, control_steps, rollout
-from hno.evaluation.closed_loop import TypeRow, classify, collided, play, tabulate
-from hno.evaluation.comparison import check_same_game, compare
+from hno.control.rollout import control_steps, rollout
+from hno.evaluation.closed_loop import CollisionTable, play
+from hno.evaluation.comparison import PairedComparison, check_same_game
 from hno.evaluation.episodes import EPISODES, episodes
+from hno.evaluation.sections import Evaluation
 from hno.games import Game
 from hno.games.grid import parse_types
 from hno.report.picture import PlotsMissingError, rollout_picture, typical
 from hno.training.checkpoint import LearnedPolicy, load_policy
-from hno.types import Extremal, Trajectory
+from hno.types import Extremal
 
 log = logging.getLogger(__name__)
+
+Types = tuple[float, ...]
+"""One type per player."""
 
 
 def run(given: Arguments) -> int:
@@ -52,9 +55,18 @@ def check(config: DictConfig) -> EvaluateSettings:
     settings = read(EvaluateSettings, config)
     with warnings.catch_warnings(action="ignore"):  # the run warns
         policies, types = load(settings)
-        for policy in policies:
-            check_sections(policy, types, OmegaConf.create(plain(settings)))
+        for evaluation in describe(settings, list(map(str, checkpoints_of(settings))), policies, types):
+            check_sections(evaluation)
     return settings
+
+
+def describe(
+    settings: EvaluateSettings, names: Sequence[str], policies: Sequence[LearnedPolicy], types: Sequence[Types]
+) -> list[Evaluation]:
+    """The evaluation of every model, before its labels are solved."""
+    options = plain(settings)
+    solve = TestLabels(policies[0].game, types, options, cache_folder(settings.cache), settings.workers)
+    return [evaluation_of(name, policy, types, options, solve) for name, policy in zip(names, policies, strict=True)]
 
 
 def load(settings: EvaluateSettings) -> tuple[list[LearnedPolicy], list[tuple[float, ...]]]:
@@ -100,22 +112,21 @@ def evaluate_models(settings: EvaluateSettings, paths: Sequence[str], results: R
     """Evaluate the models of these files; every part is written into the results as it is done."""
     use_threads(settings.threads)
     policies, types = load(settings)
-    game, config = policies[0].game, OmegaConf.create(plain(settings))
     results.update(**policies[0].names(), seed=policies[0].provenance.seed)
-    labels = solve_tests(game, types, config, cache_folder(settings.cache), settings.workers, results)
-    models, outcomes = list[dict[str, Any]](), list[Sequence[Tensor]]()
-    for path, policy in zip(paths, policies, strict=True):
-        log.info("evaluation of %s", path)
-        found = assess(policy, labels, config, results) if models else evaluate_policy(policy, labels, config, results)
-        outcomes.append(found.collided)
-        table = [row._asdict() for row in found.table]
+    evaluations = describe(settings, paths, policies, types)
+    labels = solve_tests(evaluations[0], results)
+    models, played = list[dict[str, Any]](), list[Evaluation]()
+    for policy, evaluation in zip(policies, evaluations, strict=True):
+        log.info("evaluation of %s", evaluation.name)
+        found, table = (assess if models else evaluate_policy)(evaluation, labels, results)
+        played.append(found)
         names = {**policy.names(), "seed": policy.provenance.seed}
-        models.append({"checkpoint": path, **names, "table": table})
-        for name, content in run_sections(policy, labels, config, results):
+        models.append({"checkpoint": evaluation.name, **names, "table": table})
+        for name, content in run_sections(found, results):
             models[-1][name] = content
             results.update(**models[0])
     if len(models) > 1:
-        results.update(models=models, comparison=comparison(paths, types, outcomes))
+        results.update(models=models, comparison=PairedComparison().compute(played))
     results.update(status="finished")
 
 
@@ -156,79 +167,54 @@ QUARTERS = ((0, 1), (1, 1), (1, 3), (3, 4))
 """Places in the type box, of the first player and of the others, in quarters of its edges."""
 
 
-def solve_tests(
-    game: Game,
-    types: Sequence[tuple[float, ...]],
-    settings: DictConfig,
-    cache: Path,
-    workers: int | None,
-    results: Results,
-) -> list[Extremal]:
+def solve_tests(evaluation: Evaluation, results: Results) -> list[Extremal]:
     """Labels of the test starts of every type, from the cache or solved."""
-    labels, seconds = solve_starts(game, types, settings, cache, workers, float(settings.widen))
-    results.time("test_labels", seconds)
-    results.update(test_seed=settings.seed)
+    began = time.perf_counter()
+    labels = list(evaluation.solve(evaluation.condition))
+    results.time("test_labels", time.perf_counter() - began)
+    results.update(test_seed=evaluation.condition.disturbance.seed)
     return labels
 
 
-class Outcome(NamedTuple):
-    """What came of the episodes of a policy."""
-
-    table: list[TypeRow]
-    """Type by type."""
-    played: list[Trajectory]
-    """The episodes of every type."""
-    collided: list[Tensor]
-    """Whether it collides, start by start, one (safe starts,) per type."""
+Assessed = tuple[Evaluation, list[dict[str, Any]]]
+"""An evaluation with its episodes, and the rows of its table."""
 
 
-def evaluate_policy(
-    policy: LearnedPolicy, labels: Sequence[Extremal], settings: DictConfig, results: Results
-) -> Outcome:
-    """Roll out from the starts of the labels, put the table into the results, keep some episodes and draw one."""
-    found = assess(policy, labels, settings, results)
-    write_json(results.path.parent / EPISODES, episodes(policy.game, found.played, labels, settings.clearance))
-    conditions = {name: settings[name] for name in ("clearance", "dt", "widen", "noise", "delay")}
-    results.update(**conditions, table=[row._asdict() for row in found.table], episodes=EPISODES)
-    draw(policy, labels[0], results.path.parent / "rollout.png", settings.dt)
-    return found
+def evaluate_policy(evaluation: Evaluation, labels: Sequence[Extremal], results: Results) -> Assessed:
+    """Play from the starts of the labels, put the table into the results, keep some episodes and draw one."""
+    found, table = assess(evaluation, labels, results)
+    folder, game = results.path.parent, found.game
+    write_json(folder / EPISODES, episodes(game, found.played, labels, found.clearance))
+    conditions = {name: found.options[name] for name in ("clearance", "dt", "widen", "noise", "delay")}
+    results.update(**conditions, constraint_unit=game.constraint_unit, table=table, episodes=EPISODES)
+    title = " / ".join(str(results.content[name]) for name in ("game", "operator", "activation"))
+    draw(found, folder / "rollout.png", title)
+    return found, table
 
 
-def assess(policy: LearnedPolicy, labels: Sequence[Extremal], settings: DictConfig, results: Results) -> Outcome:
-    """Roll out from the starts of the labels."""
+def assess(evaluation: Evaluation, labels: Sequence[Extremal], results: Results) -> Assessed:
+    """Play from the starts of the labels."""
     began = time.perf_counter()
-    disturbance = Disturbance(settings.noise, settings.delay, settings.seed)
-    played = play(policy.game, policy, labels, settings.dt, disturbance)
-    table = tabulate(policy.game, labels, played, policy.types, settings.clearance, policy.operator.field)
-    safe = [classify(found, settings.clearance)[0] for found in labels]
+    disturbance = evaluation.condition.disturbance
+    played = play(evaluation.game, evaluation.policy, labels, evaluation.dt, disturbance)
+    found = evaluation._replace(labels=labels, played=played)
+    table = CollisionTable().compute(found)
     results.time("evaluation", time.perf_counter() - began)
-    return Outcome(table, played, [collided(part)[mask] for part, mask in zip(played, safe, strict=True)])
+    return found, table
 
 
-def comparison(
-    paths: Sequence[str], types: Sequence[tuple[float, ...]], outcomes: Sequence[Sequence[Tensor]]
-) -> dict[str, Any]:
-    """Every model against the first, over all types and type by type."""
-    rows = []
-    for path, other in zip(paths[1:], outcomes[1:], strict=True):
-        pairs = zip(types, outcomes[0], other, strict=True)
-        by_type = [{"theta": theta, **compare(first, second)._asdict()} for theta, first, second in pairs]
-        whole = compare(torch.cat(list(outcomes[0])), torch.cat(list(other)))
-        rows.append({"checkpoint": path, **whole._asdict(), "types": by_type})
-    return {"reference": paths[0], "models": rows}
-
-
-def draw(policy: LearnedPolicy, found: Extremal, path: Path, dt: float, episodes: int = 15) -> None:
-    """Draw a typical episode from the first starts of a label set; without matplotlib, say so."""
-    starts, theta = found.x[:episodes, 0].float(), found.theta[:episodes].float()
-    played = rollout(policy.game, policy, starts, theta, dt)
-    names = policy.names()
+def draw(evaluation: Evaluation, path: Path, title: str, episodes: int = 15) -> None:
+    """Draw a typical episode from the first starts of the first type; without matplotlib, say so."""
+    labels, game = evaluation.labels[0], evaluation.game
+    starts, theta = labels.x[:episodes, 0].float(), labels.theta[:episodes].float()
+    played = rollout(game, evaluation.policy, starts, theta, evaluation.dt)
     try:
-        rollout_picture(policy.game, played, theta, path, " / ".join(names.values()), typical(played))
+        rollout_picture(game, played, theta, path, title, typical(played))
     except PlotsMissingError as error:
         log.info("No picture: %s", error)
 
 
 def check_evaluation(game: Game, settings: Episodes) -> None:
     """Raise ValueError for entries that make no evaluation of the game."""
+    table_condition(game, plain(settings))
     control_steps(game, settings.dt)

@@ -20,9 +20,9 @@ from hno.cli.logs import use_threads
 from hno.cli.schema import LabelSettings
 from hno.cli.starts import cache_folder
 from hno.data import labels as label_data
+from hno.data.certificates import GLOBAL_GAP, LOCAL_GAP, summary
 from hno.data.labels import Report, Request, label_set, labels_for
 from hno.data.store import LabelFileError
-from hno.data.trust import GLOBAL_GAP, LOCAL_GAP, summary
 from hno.games import Game
 from hno.games.grid import parse_types
 from hno.types import Status

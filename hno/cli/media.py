@@ -11,11 +11,11 @@ from typing import Any
 
 from lightning.pytorch.loggers import Logger, TensorBoardLogger, WandbLogger
 
+from hno.evaluation.format import number
+from hno.evaluation.outcome import pooled
 from hno.report.collision_map import collision_map
 from hno.report.gif import animate
 from hno.report.picture import PlotsMissingError
-from hno.report.totals import totals
-from hno.report.words import number
 
 log = logging.getLogger(__name__)
 
@@ -45,11 +45,11 @@ def publish(loggers: Sequence[Logger], results: Mapping[str, Any], folder: Path,
 
 def numbers(results: Mapping[str, Any]) -> dict[str, float]:
     """Results under the names by which dashboards show them; what does not exist is left out."""
-    whole, validation = totals(results["table"]), results.get("validation") or {}
+    whole, validation = pooled(results["table"]), results.get("validation") or {}
     found = {
         "test/collision_rate": whole.rate,
         "test/worst_type": whole.worst_rate,
-        "test/excess_cost": whole.excess,
+        "test/excess_cost": whole.relative_excess,
         "test/safe_starts": whole.safe_starts,
         "best/collision_rate": validation.get("collision_rate"),
         "best/excess_cost": validation.get("excess"),
@@ -102,7 +102,7 @@ def _clearance(episode: Mapping[str, Any]) -> float:
 
 def _send_to_wandb(logger: WandbLogger, results: Mapping[str, Any], pictures: Mapping[str, Path], step: int) -> None:
     logger.log_metrics(numbers(results), step)
-    whole = totals(results["table"])
+    whole = pooled(results["table"])
     nobody = "n/a" if whole.rate is None else "none"
     logger.experiment.summary["test/worst_theta"] = name_of(whole.worst_theta) if whole.worst_theta else nobody
     for name, path in pictures.items():

@@ -14,9 +14,8 @@ from rich.console import Console
 from rich.table import Table
 
 from hno.cli import pages
-from hno.cli.tables import types
-from hno.report.totals import totals
-from hno.report.words import interval, percent, signed
+from hno.evaluation.format import interval, percent, signed, types
+from hno.evaluation.outcome import pooled
 
 NAMES = ("game", "operator", "activation", "seed")
 """Entries of results.json that name a job, in the order by which jobs are sorted."""
@@ -105,14 +104,14 @@ def _names(found: Mapping[str, Any]) -> list[str]:
 
 
 def _cells(found: Mapping[str, Any]) -> list[str]:
-    whole = totals(found.get("table", ()))
+    whole = pooled(found.get("table", ()))
     spent = found.get("seconds", {}).values()
     at = f" at {types(whole.worst_theta)}" if whole.worst_theta else ""
     return [
         f"{whole.collisions} of {whole.safe_starts}" if whole.safe_starts else "n/a",
         interval(whole.interval),
         percent(whole.worst_rate) + at,
-        signed(whole.excess),
+        signed(whole.relative_excess),
         f"{sum(spent):.0f}" if spent else "n/a",
         str(found["status"]),
     ]

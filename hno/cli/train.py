@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import logging
 import shutil
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import lightning as L
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import OmegaConf
 
 from hno.cli import launch
 from hno.cli.arguments import Arguments
@@ -36,14 +34,14 @@ from hno.cli.logs import (
     use_threads,
 )
 from hno.cli.media import publish
-from hno.cli.ntk import ntk_section
 from hno.cli.results import Results, config_hash, plain
 from hno.cli.schema import TrainSettings
-from hno.cli.starts import cache_folder
+from hno.cli.sections import evaluation_of, run_sections
+from hno.cli.starts import TestLabels, cache_folder
 from hno.cli.summary import report, show
+from hno.data.certificates import summary
 from hno.data.datamodule import GameData, safe_sets
 from hno.data.labels import Request, safe_labels_for
-from hno.data.trust import summary
 from hno.games.grid import parse_types
 from hno.operators import make_operator
 from hno.training.checkpoint import Provenance, check_resumable, load_policy, record
@@ -98,16 +96,14 @@ def train(settings: TrainSettings) -> bool:
 
 def _run(settings: TrainSettings, folder: Path, results: Results) -> None:
     fitted = train_operator(settings, folder, results)
-    chosen, policy = settings.evaluation, load_policy(fitted.checkpoint)
-    types = list(dict.fromkeys([*policy.types, *unseen_types(policy.game, chosen.types, "evaluation.types")]))
-    evaluation = OmegaConf.create(plain(chosen))
-    cache, workers = cache_folder(settings.data.cache), settings.data.workers
-    test = solve_tests(policy.game, types, evaluation, cache, workers, results)
-    evaluate_policy(policy, test, evaluation, results)
-    if chosen.ntk:
-        began = time.perf_counter()
-        results.update(ntk=ntk_section(policy, test, evaluation))
-        results.time("ntk", time.perf_counter() - began)
+    chosen, policy = plain(settings.evaluation), load_policy(fitted.checkpoint)
+    unseen = unseen_types(policy.game, settings.evaluation.types, "evaluation.types")
+    types = list(dict.fromkeys([*policy.types, *unseen]))
+    solve = TestLabels(policy.game, types, chosen, cache_folder(settings.data.cache), settings.data.workers)
+    evaluation = evaluation_of(results.content["checkpoint"], policy, types, chosen, solve)
+    assessed, _ = evaluate_policy(evaluation, solve_tests(evaluation, results), results)
+    for name, content in run_sections(assessed, results):
+        results.update(**{name: content})
     results.update(status="finished")
     publish(fitted.trainer.loggers, results.content, folder, fitted.trainer.global_step)
 

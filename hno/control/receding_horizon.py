@@ -1,4 +1,4 @@
-"""A policy that solves the rest of the game again while it plays: the yardstick of learned ones."""
+"""A policy that solves the rest of the game again while it plays."""
 
 from __future__ import annotations
 

@@ -15,12 +15,12 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, IterableDataset
 
+from hno.data.certificates import CLEARANCE, safe
 from hno.data.curriculum import Curriculum
 from hno.data.exchange import read_own
 from hno.data.labels import Report, Request, default_cache, labels_for
 from hno.data.rows import rows_of
 from hno.data.sources import Known, Pool, Sampler, make_sampler, sample_points
-from hno.data.trust import CLEARANCE, safe
 from hno.games import Game
 from hno.pontryagin.solve import Solver
 from hno.types import Batch, Extremal, Sample, Trajectory, Types, part

@@ -15,9 +15,9 @@ import joblib
 import torch
 from torch import Tensor
 
+from hno.data.certificates import CLEARANCE, safe
 from hno.data.shards import SHARD, LabelSet
 from hno.data.store import canonical_json
-from hno.data.trust import CLEARANCE, safe
 from hno.games import Game
 from hno.pontryagin.solve import Solver, solve
 from hno.types import Extremal, Status, part
@@ -43,6 +43,8 @@ class Request(NamedTuple):
     """What the states are for, "train", "validation" or "test": different splits never share states."""
     widen: float = 1.0
     """Width of the start box in units of the game's."""
+    symmetric: bool = False
+    """Whether all players start in the same own state, that of the first player."""
 
 
 class Progress(NamedTuple):
@@ -67,10 +69,22 @@ def default_cache() -> Path:
 
 
 def start_states(game: Game, request: Request) -> Tensor:
-    """Uniform start states of a request, float64, (starts, P, n); more of them begin with the fewer."""
+    """Uniform start states of a request, float64, (starts, P, n); more of them begin with the fewer.
+
+    Raises:
+        ValueError: symmetric ones of a game whose players are not interchangeable.
+    """
+    if request.symmetric and not interchangeable(game):
+        raise ValueError(f"Symmetric starts need players of one role; {type(game).__name__} has roles {game.roles}.")
     text = canonical_json({"seed": request.seed, "split": request.split, "theta": [float(t) for t in request.theta]})
     generator = torch.Generator().manual_seed(int(hashlib.sha256(text.encode()).hexdigest()[:15], 16))
-    return game.initial_box.widened(request.widen).cpu().float().sample(request.starts, generator).double()
+    drawn = game.initial_box.widened(request.widen).cpu().float().sample(request.starts, generator).double()
+    return drawn[:, :1].expand_as(drawn).contiguous() if request.symmetric else drawn
+
+
+def interchangeable(game: Game) -> bool:
+    """Whether all players have the same role, without which no start is symmetric."""
+    return len(set(game.roles)) == 1
 
 
 def label_set(game: Game, request: Request, cache: Path, settings: Solver = Solver()) -> LabelSet:
@@ -85,6 +99,8 @@ def provenance(game: Game, request: Request, settings: Solver) -> dict[str, Any]
     """Everything that determines labels, but for how many there are: row k of a set is always the same."""
     content = request._replace(theta=tuple(map(float, request.theta)))._asdict()
     del content["starts"]
+    if not request.symmetric:
+        del content["symmetric"]  # keeps the keys of sets that were solved before there were symmetric starts
     return {
         "game": type(game).__name__,
         "constants": _changed_constants(game),

@@ -13,8 +13,8 @@ from typing import Any
 
 import filelock
 
+from hno.data.certificates import summary
 from hno.data.store import LabelFileError, canonical_json, checksum, read_labels, replace_whole, row_count, write_labels
-from hno.data.trust import summary
 from hno.types import Extremal, join, part
 
 SHARD = 128

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from hno.games import Game
+from hno.pontryagin.adjoint import gradient_of
 from hno.registry import Registry, check_options
 from hno.types import Points
 
@@ -171,7 +172,7 @@ def sample_points(
     game: Game, theta: Tensor, sampler: Sampler, known: Known, window: float, generator: torch.Generator
 ) -> Points:
     """Collocation points of given types (B, P) from a mixture of sources."""
-    weights = torch.tensor([share.weight for share in sampler.values()])
+    weights = torch.tensor([float(share.weight) for share in sampler.values()])
     chosen = torch.multinomial(weights, len(theta), replacement=True, generator=generator)
     tau, x = theta.new_empty(len(theta)), theta.new_empty(len(theta), game.players, game.state_dim)
     for number, share in enumerate(sampler.values()):
@@ -215,7 +216,7 @@ def onto_band(game: Game, x: Tensor, theta: Tensor, target: Tensor, iterations: 
         with torch.enable_grad():
             x = x.detach().requires_grad_()
             worst = game.constraint(x, theta).amax((-2, -1))
-            slope = torch.autograd.grad(worst.sum(), x)[0] * width
+            slope = gradient_of(worst.sum(), x) * width
         size = slope.square().sum((-2, -1)).clamp_min(1e-12)
         step = ((target - worst.detach()) / size)[:, None, None] * slope * width
         x = game.state_box.clamp(x.detach() + step)

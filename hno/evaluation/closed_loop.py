@@ -2,70 +2,48 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor
 from torchmetrics import WeightedMeanAbsolutePercentageError
 
 from hno.control.rollout import Disturbance, Player, rollout
 from hno.data.rows import rows_of
-from hno.evaluation.metrics import CollisionRate, Quantiles, SaturatedShare, clopper_pearson
+from hno.evaluation import format as text
+from hno.evaluation.outcome import Outcome, outcome, pooled
+from hno.evaluation.sections import Column, Evaluation, ModelSection, sections
 from hno.games import Game
 from hno.types import Extremal, Field, Points, Status, Trajectory
 
 ValueField = Callable[[Points], Field]
 """A value function with its derivatives, such as `ValueOperator.field`."""
-SHARES = (0.05, 0.25, 0.5)
-"""Quantiles of the smallest distance that are reported."""
+Type = tuple[float, ...]
+"""Types of all players."""
 
 
 class TypeRow(NamedTuple):
-    """One line of the collision table; numbers that do not exist or are not finite are None."""
+    """One line of the collision table."""
 
-    theta: tuple[float, ...]
+    theta: Type
     """Player types."""
     seen: bool
     """Whether the operator was trained with labels of these types."""
-    starts: int
-    """Start states asked for."""
-    unsolved: int
-    """Starts without a converged label; they do not count."""
-    inevitable: int
-    """Starts whose equilibrium collides; they do not count."""
-    marginal: int
-    """Starts whose equilibrium is safe but keeps less than the stated clearance; counted apart."""
-    marginal_collisions: int
-    """Collisions among those."""
-    safe_starts: int
-    """Starts that count."""
-    collisions: int
-    """Collisions among those, between steps too."""
-    rate: float | None
-    """Collisions per safe start."""
-    interval: tuple[float, float] | None
-    """Clopper-Pearson 95 % interval of the rate."""
-    median_min_distance: float | None
-    """Median over safe starts of the smallest distance between players, m."""
-    median_excess_cost: float | None
-    """Median over safe starts of the joint cost above the label's."""
-    median_label_cost: float | None
-    """Median over safe starts of the label's joint cost."""
-    distance_quantiles: tuple[float, ...] | None = None
-    """5 %, 25 % and 50 % quantiles over safe starts of the smallest distance between players, m."""
-    median_excess_costs: tuple[float, ...] | None = None
-    """Median over safe starts of each player's own cost above the label's."""
-    saturated: float | None = None
-    """Share of controls on a bound of their box, over steps, players and controls of safe starts."""
-    value_error: float | None = None
-    """Weighted absolute percentage error of values at the nodes of converged labels, as a fraction."""
-    costate_error: float | None = None
-    """The same of all costates."""
-    extrapolated: bool = False
+    extrapolated: bool
     """Whether the types lie outside the range that the game is made for."""
-    outside_seen: bool = False
+    outside_seen: bool
     """Whether they lie outside the smallest box around the types that the operator was trained with, if any."""
+    outcome: Outcome
+    """What came of the episodes."""
+    value_error: float | None
+    """Weighted absolute percentage error of values at the nodes of converged labels, as a fraction, if any."""
+    costate_error: float | None
+    """The same of all costates."""
+
+    def content(self) -> dict[str, Any]:
+        """All entries with those of the outcome beside them, for results.json."""
+        content = self._asdict()
+        return content | content.pop("outcome")._asdict()
 
 
 def collision_table(
@@ -78,19 +56,19 @@ def collision_table(
     disturbance: Disturbance = Disturbance(),
     field: ValueField | None = None,
 ) -> list[TypeRow]:
-    """Roll out a policy from the start states of labels and compare.
+    """Play from the start states of labels and compare.
 
     Args:
         game: the game.
         policy: feedback controls of all players.
         labels: one set per type.
         seen: types that the operator was trained with.
-        clearance: what the label must keep for its start to count, m for distance constraints.
+        clearance: what the label must keep for its start to count, in the unit of the game's constraint.
         dt: time for which a control is held, s.
         disturbance: of the episodes.
         field: the policy's value function, if it has one.
     """
-    return tabulate(game, labels, play(game, policy, labels, dt, disturbance), seen, clearance, field)
+    return type_rows(game, labels, play(game, policy, labels, dt, disturbance), seen, clearance, field)
 
 
 def play(
@@ -105,7 +83,7 @@ def play(
     return [Trajectory(played.t, *part) for part in columns]
 
 
-def tabulate(
+def type_rows(
     game: Game,
     labels: Sequence[Extremal],
     played: Sequence[Trajectory],
@@ -114,66 +92,32 @@ def tabulate(
     field: ValueField | None = None,
 ) -> list[TypeRow]:
     """The table of episodes that were played from the starts of labels. See `collision_table`."""
-    known = {tuple(float(t) for t in theta) for theta in seen}
+    known = [tuple(float(t) for t in theta) for theta in seen]
     return [_row(game, *sets, known, clearance, field) for sets in zip(labels, played, strict=True)]
 
 
 def _row(
     game: Game,
-    found: Extremal,
+    labels: Extremal,
     played: Trajectory,
-    seen: set[tuple[float, ...]],
+    seen: Sequence[Type],
     clearance: float,
     field: ValueField | None,
 ) -> TypeRow:
-    theta = tuple(float(t) for t in found.theta[0])
-    solved = found.status == Status.CONVERGED
-    safe, marginal = classify(found, clearance)
-    rate, saturated, distance = CollisionRate(), SaturatedShare(game.control_box), Quantiles(SHARES)
-    rate.update(played.clearance, safe)
-    saturated.update(played.u, safe)
-    distance.update(played.distance[safe])
-    collisions, counted = int(rate.collisions), int(rate.episodes)
-    excess, label_cost = excess_costs(found, played), -found.value[:, 0].sum(-1)
-    errors = (None, None) if field is None else label_errors(game, field, found)
+    theta = tuple(float(t) for t in labels.theta[0])
     return TypeRow(
-        theta=theta,
-        seen=theta in seen,
-        starts=len(solved),
-        unsolved=int((~solved).sum()),
-        inevitable=int((solved & (found.clearance <= 0)).sum()),
-        marginal=int(marginal.sum()),
-        marginal_collisions=int((marginal & collided(played)).sum()),
-        safe_starts=counted,
-        collisions=collisions,
-        rate=collisions / counted if counted else None,
-        interval=clopper_pearson(collisions, counted),
-        median_min_distance=median(played.distance[safe]),
-        median_excess_cost=median(excess.sum(-1)[safe]),
-        median_label_cost=median(label_cost[safe]),
-        distance_quantiles=_finite(distance.compute()),
-        median_excess_costs=_finite(excess[safe].median(0).values) if counted else None,
-        saturated=float(saturated.compute()) if counted else None,
-        value_error=errors[0],
-        costate_error=errors[1],
-        extrapolated=not bool(game.type_box.contains(found.theta[0].to(game.type_box.lo))),
-        outside_seen=bool(seen) and not _inside_hull(theta, seen),
+        theta,
+        theta in seen,
+        not bool(game.type_box.contains(labels.theta[0].to(game.type_box.lo))),
+        bool(seen) and not _inside_hull(theta, seen),
+        outcome(game, labels, played, clearance),
+        *((None, None) if field is None else label_errors(game, field, labels)),
     )
 
 
-def _inside_hull(theta: tuple[float, ...], seen: set[tuple[float, ...]]) -> bool:
+def _inside_hull(theta: Type, seen: Sequence[Type]) -> bool:
     """Whether types lie in the smallest box around others."""
     return all(min(column) <= t <= max(column) for t, column in zip(theta, zip(*seen, strict=True), strict=True))
-
-
-def collided(played: Trajectory) -> Tensor:
-    """Which episodes collide, (B,): those that keep no positive clearance, NaN too."""
-    return ~(played.clearance > 0)
-
-
-def excess_costs(found: Extremal, played: Trajectory) -> Tensor:
-    """Each player's cost above the label's, (B, P)."""
-    return found.value[:, 0] - played.value.double()
 
 
 def label_errors(game: Game, field: ValueField, found: Extremal) -> tuple[float | None, float | None]:
@@ -185,26 +129,89 @@ def label_errors(game: Game, field: ValueField, found: Extremal) -> tuple[float 
         return None, None
     points, labels, _ = rows_of(game, [found])
     assert labels is not None
-    told = field(points)
+    predicted = field(points)
     value, costate = WeightedMeanAbsolutePercentageError(), WeightedMeanAbsolutePercentageError()
-    value.update(told.value, labels.value)
-    costate.update(told.costate.flatten(1), labels.costate.flatten(1))
+    value.update(predicted.value, labels.value)
+    costate.update(predicted.costate.flatten(1), labels.costate.flatten(1))
     return float(value.compute()), float(costate.compute())
 
 
-def classify(found: Extremal, clearance: float) -> tuple[Tensor, Tensor]:
-    """Which starts count, and which are safe by less than the stated clearance, each (B,)."""
-    solved = found.status == Status.CONVERGED
-    safe = solved & (found.clearance >= clearance)
-    return safe, solved & (found.clearance > 0) & ~safe
+@sections.register("table")
+class CollisionTable(ModelSection):
+    """Collisions, distances, costs and errors by type."""
+
+    heading = "Collisions by type"
+    note = (
+        "safe: starts whose equilibrium keeps the clearance; distance: smallest, 5 % quantile and median; excess cost: "
+        "above the equilibrium's joint cost, median; saturated: controls on a bound; errors: of values and costates "
+        "along labels; apart: unsolved / inevitable / marginal starts"
+    )
+    columns = (
+        Column("theta", "theta", format=text.types),
+        Column("labels", "labels"),
+        Column("safe", "safe", format=lambda counts: f"{counts[0]:,} of {counts[1]:,}"),
+        Column("collisions", "collisions", format=text.whole),
+        Column("rate", "rate", format=text.percent),
+        Column("interval", "95 % interval", format=text.interval),
+        Column("distances", "distance", "m", text.numbers),
+        Column("excess", "excess cost", format=text.cost),
+        Column("saturated", "saturated", format=lambda share: text.percent(share, 1)),
+        Column("errors", "errors", format=lambda errors: ", ".join(text.percent(error, 1) for error in errors)),
+        Column("apart", "apart", format=lambda counts: " / ".join(map(text.whole, counts))),
+    )
+
+    def compute(self, evaluation: Evaluation) -> list[dict[str, Any]]:
+        """One line per type."""
+        labels, played, seen = evaluation.labels, evaluation.played, evaluation.seen
+        field, clearance = evaluation.operator.field, evaluation.clearance
+        return [row.content() for row in type_rows(evaluation.game, labels, played, seen, clearance, field)]
+
+    def rows(self, content: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+        """One line per type, with entries that belong together in one column."""
+        return [
+            {
+                **row,
+                "labels": "seen" if row["seen"] else "unseen",
+                "safe": (row["safe_starts"], row["starts"]),
+                "distances": row["distance_quantiles"] and row["distance_quantiles"][::2],
+                "excess": (row["median_excess_cost"], row["median_label_cost"]),
+                "errors": (row["value_error"], row["costate_error"]),
+                "apart": (row["unsolved"], row["inevitable"], row["marginal"]),
+            }
+            for row in content
+        ]
+
+    def remarks(self, content: Sequence[Mapping[str, Any]], results: Mapping[str, Any]) -> list[str]:
+        """The totals, which types have no rate and why, and which lie outside the game's range or that of training."""
+        keeps = f"{results['clearance']:g} {results['constraint_unit']}".strip()
+        said = [verdict(content)]
+        said += [
+            f"No rate (n/a) at {_at(row)}: of {row['starts']} starts none has an equilibrium that keeps {keeps}; "
+            f"{row['unsolved']} unsolved, {row['inevitable']} inevitable, {row['marginal']} marginal."
+            for row in content
+            if row["rate"] is None
+        ]
+        outside = [_at(row) for row in content if row["extrapolated"]]
+        if outside:
+            said.append(f"Outside the types that the game is made for, results extrapolate: {', '.join(outside)}.")
+        beyond = [_at(row) for row in content if row["outside_seen"]]
+        if beyond:
+            counts = f"{len(beyond)} of {text.counted(len(content), 'type')}"
+            said.append(f"{counts} lie outside the box around the trained ones: {', '.join(beyond)}.")
+        return said
 
 
-def median(values: Tensor) -> float | None:
-    """The lower median; None without numbers, or where it is not finite."""
-    found = _finite(values.median().reshape(1))
-    return None if found is None else found[0]
+def verdict(rows: Sequence[Mapping[str, Any]]) -> str:
+    """The totals over all types in one sentence."""
+    whole = pooled(rows)
+    if whole.rate is None:
+        return "No start has a safe equilibrium: there is no collision rate (n/a)."
+    collisions, starts = text.counted(whole.collisions, "collision"), text.counted(whole.safe_starts, "safe start")
+    worst = ""
+    if whole.worst_theta is not None:
+        worst = f"; worst {text.percent(whole.worst_rate)} at ({text.types(whole.worst_theta)})"
+    return f"{collisions} in {starts} ({text.percent(whole.rate)}){worst}."
 
 
-def _finite(values: Tensor) -> tuple[float, ...] | None:
-    """Numbers (N,) as they are stored; None if one is not finite."""
-    return tuple(values.tolist()) if bool(values.isfinite().all()) else None
+def _at(row: Mapping[str, Any]) -> str:
+    return f"({text.types(row['theta'])})"

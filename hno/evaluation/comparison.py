@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
+import torch
 from scipy.optimize import brentq
 from scipy.stats import binomtest, norm
 from torch import Tensor
 
+from hno.data.certificates import safe
+from hno.evaluation import format as text
+from hno.evaluation.sections import Column, Evaluation, Section, sections
 from hno.games import Game
 
 
@@ -110,3 +114,52 @@ def _upper(b: int, c: int, n: int, z: float) -> float:
         return (c - b - n * delta) ** 2 - z**2 * n * (2 * only_first + delta * (1 - delta))
 
     return float(brentq(excess, estimate + 1e-12, 1.0, xtol=1e-12))
+
+
+@sections.register("comparison")
+class PairedComparison(Section):
+    """Every model against the first, on the same starts."""
+
+    heading = "Models against the first of them, from the same starts"
+    note = "interval: Tango's score interval of the paired difference; p: exact McNemar test of equal rates"
+    columns = (
+        Column("model", "model"),
+        Column("starts", "starts", format=text.whole),
+        Column("both", "both", format=text.whole),
+        Column("only_reference", "only first", format=text.whole),
+        Column("only_other", "only this", format=text.whole),
+        Column("difference", "difference of rates", format=text.percent),
+        Column("interval", "95 % interval", format=text.interval),
+        Column("p_value", "p", format=lambda p: text.significant(p, 2)),
+    )
+
+    def compute(self, evaluations: Sequence[Evaluation]) -> dict[str, Any]:
+        """Every model against the first, over all types and type by type."""
+        reference, *others = evaluations
+        first, rows = _collisions(reference), []
+        for other in others:
+            second = _collisions(other)
+            pairs = zip(other.types, first, second, strict=True)
+            by_type = [{"theta": theta, **compare(*pair)._asdict()} for theta, *pair in pairs]
+            whole = compare(torch.cat(first), torch.cat(second))
+            rows.append({"checkpoint": other.name, **whole._asdict(), "types": by_type})
+        return {"reference": reference.name, "models": rows}
+
+    def rows(self, content: Mapping[str, Any]) -> list[dict[str, Any]]:
+        """One line per model but the first."""
+        _, *names = _names(content)
+        return [{**row, "model": name} for name, row in zip(names, content["models"], strict=True)]
+
+    def remarks(self, content: Mapping[str, Any], results: Mapping[str, Any]) -> list[str]:
+        """Which model is the first."""
+        return [f"All models are compared against {_names(content)[0]}."]
+
+
+def _names(content: Mapping[str, Any]) -> list[str]:
+    return text.short_names([content["reference"], *(row["checkpoint"] for row in content["models"])])
+
+
+def _collisions(evaluation: Evaluation) -> list[Tensor]:
+    """Whether the model collides, safe start by safe start, one (safe starts,) per type."""
+    pairs = zip(evaluation.labels, evaluation.played, strict=True)
+    return [played.collided[safe(labels, evaluation.clearance)] for labels, played in pairs]

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hno.evaluation.closed_loop import classify
+from hno.data.certificates import safe
 from hno.games import Game
 from hno.games.kinematics import separation
 from hno.types import Extremal, Trajectory
@@ -28,35 +28,36 @@ def episodes(game: Game, played: Sequence[Trajectory], labels: Sequence[Extremal
         game: the game.
         played: episodes from the start states of the labels, one set per type.
         labels: one set per type.
-        clearance: what the label must keep for its start to count, m for distance constraints.
+        clearance: what the label must keep for its start to count, in the unit of the game's constraint.
 
     Returns:
-        JSON content: positions of all players over time, the distance below which it is a collision, the path of the
-        equilibrium from the same start, costs. Types without a start that counts are left out.
+        JSON content: positions of all players over time, the distance below which it is a collision where the
+        constraint is one, the path of the equilibrium from the same start, costs. Types without a start that counts
+        are left out.
     """
     kept = []
     for found, part in zip(labels, played, strict=True):
-        safe = classify(found, clearance)[0].nonzero().squeeze(-1)
-        for kind, row in _chosen(part.clearance[safe], part.distance[safe]).items():
-            kept.append({"kind": kind, **_episode(game, part, found, int(safe[row]))})
+        counted = safe(found, clearance).nonzero().squeeze(-1)
+        for kind, row in _chosen(part.clearance[counted]).items():
+            kept.append({"kind": kind, **_episode(game, part, found, int(counted[row]))})
     dimensions = game.positions(played[0].x[:1, 0]).shape[-1]
-    return {"players": game.players, "dimensions": dimensions, "episodes": kept}
+    units = {"players": game.players, "dimensions": dimensions, "constraint_unit": game.constraint_unit}
+    return {**units, "episodes": kept}
 
 
-def _chosen(clearance: Tensor, distance: Tensor) -> dict[str, int]:
-    """Rows by what they stand for: the smallest clearance (NaN first), and the median of the smallest distances."""
+def _chosen(clearance: Tensor) -> dict[str, int]:
+    """Rows by what they stand for: the smallest clearance (NaN first), and the median one."""
     if len(clearance) == 0:
         return {}
-    return {"worst": int(clearance.argmin()), "typical": int(distance.argsort()[len(distance) // 2])}
+    return {"worst": int(clearance.argmin()), "typical": int(clearance.argsort()[len(clearance) // 2])}
 
 
 def _episode(game: Game, played: Trajectory, label: Extremal, row: int) -> dict[str, Any]:
     theta = label.theta[row].to(played.x)
-    closest = int(separation(game.positions(played.x[row])).amin(-1).nan_to_num(math.inf).argmin())
+    violation = game.constraint(played.x[row], theta.expand(len(played.t), -1)).flatten(1).amax(-1)
+    closest = int(violation.nan_to_num(-math.inf).argmax())
     frames = sorted({*range(0, len(played.t), math.ceil(len(played.t) / FRAMES)), closest})
-    t, x = played.t[frames], played.x[row, frames]
-    places = game.positions(x)
-    radius = game.constraint(x, theta.expand(len(t), -1)).amax((-2, -1)) + separation(places).amin(-1)
+    t, places = played.t[frames], game.positions(played.x[row, frames])
     return {
         "theta": [float(entry) for entry in theta],
         "collided": not float(played.clearance[row]) > 0,
@@ -66,9 +67,16 @@ def _episode(game: Game, played: Trajectory, label: Extremal, row: int) -> dict[
         "label_cost": _rounded(-label.value[row, 0].sum()),
         "t": _rounded(t),
         "positions": _rounded(places),
-        "radius": _rounded(radius),
-        "label_positions": _rounded(_at(t, label.t, game.positions(label.x[row].to(x)))),
+        "radius": _radius(game, places, violation[frames]),
+        "label_positions": _rounded(_at(t, label.t, game.positions(label.x[row].to(places)))),
     }
+
+
+def _radius(game: Game, places: Tensor, violation: Tensor) -> Any:
+    """Distance of players below which it is a collision at each time, m; None where the constraint is no distance."""
+    if game.players == 1 or game.constraint_unit != "m":
+        return None
+    return _rounded(violation + separation(places).amin(-1))
 
 
 def _at(times: Tensor, t: Tensor, places: Tensor) -> Tensor:

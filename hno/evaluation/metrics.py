@@ -7,131 +7,55 @@ from collections.abc import Sequence
 import torch
 from scipy.stats import binomtest
 from torch import Tensor
-from torchmetrics import Metric
-from torchmetrics.utilities import dim_zero_cat
 
 from hno.games import Box
 
 
-class CollisionRate(Metric):
-    """Share of counted episodes that collide; NaN when none is counted."""
-
-    full_state_update = False
-    collisions: Tensor
-    episodes: Tensor
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.add_state("collisions", torch.tensor(0), dist_reduce_fx="sum")
-        self.add_state("episodes", torch.tensor(0), dist_reduce_fx="sum")
-
-    def update(self, clearance: Tensor, counted: Tensor) -> None:
-        """Add episodes.
-
-        Args:
-            clearance: smallest -constraint of each, (B,); a collision is whatever is not above 0, NaN too.
-            counted: which of them count, (B,).
-        """
-        self.collisions += (~(clearance > 0) & counted).sum()
-        self.episodes += counted.sum()
-
-    def compute(self) -> Tensor:
-        """The share."""
-        return self.collisions / self.episodes
-
-
-class Quantiles(Metric):
-    """Quantiles of numbers, each one of them (the lower of two neighbours); NaN without any, or with a NaN among them.
+def quantiles(values: Tensor, shares: Sequence[float]) -> Tensor:
+    """Quantiles of numbers, each one of them: the lower of two neighbours.
 
     Args:
+        values: the numbers, (B,).
         shares: which quantiles, in [0, 1].
+
+    Returns:
+        float64, (shares,); NaN without any number, or with a NaN among them.
     """
-
-    full_state_update = False
-    values: list[Tensor]
-    shares: Tensor
-
-    def __init__(self, shares: Sequence[float]) -> None:
-        super().__init__()
-        self.register_buffer("shares", torch.tensor(shares, dtype=torch.float64))
-        self.add_state("values", [], dist_reduce_fx="cat")
-
-    def update(self, values: Tensor) -> None:
-        """Add numbers, (B,)."""
-        self.values.append(values.double())
-
-    def compute(self) -> Tensor:
-        """The quantiles, (shares,)."""
-        values = dim_zero_cat(self.values) if self.values else self.shares.new_empty(0)
-        if len(values) == 0:
-            return torch.full_like(self.shares, torch.nan)
-        return values.quantile(self.shares, interpolation="lower")
+    at = torch.tensor(shares, dtype=torch.float64, device=values.device)
+    if len(values) == 0:
+        return torch.full_like(at, torch.nan)
+    return values.double().quantile(at, interpolation="lower")
 
 
-class SaturatedShare(Metric):
-    """Share of controls that lie on a bound of their box, of every step, player and control of the counted episodes.
+def saturated_share(u: Tensor, box: Box, tolerance: float = 1e-4) -> float | None:
+    """Share of controls that lie on a bound of their box, over episodes, steps, players and controls.
 
     Args:
-        box: of controls.
+        u: controls, (B, K, P, m).
+        box: of the controls of each player, (m,) or (P, m).
         tolerance: distance from a bound that counts as on it, in widths of the box.
+
+    Returns:
+        The share; None without controls.
     """
-
-    full_state_update = False
-    saturated: Tensor
-    controls: Tensor
-
-    def __init__(self, box: Box, tolerance: float = 1e-4) -> None:
-        super().__init__()
-        self.box, self.tolerance = box, tolerance
-        self.add_state("saturated", torch.tensor(0), dist_reduce_fx="sum")
-        self.add_state("controls", torch.tensor(0), dist_reduce_fx="sum")
-
-    def update(self, u: Tensor, counted: Tensor) -> None:
-        """Add episodes.
-
-        Args:
-            u: controls, (B, K, P, m).
-            counted: which episodes count, (B,).
-        """
-        inside = torch.minimum(u - self.box.lo, self.box.hi - u)[counted] / self.box.width
-        self.saturated += (inside <= self.tolerance).sum()
-        self.controls += inside.numel()
-
-    def compute(self) -> Tensor:
-        """The share; NaN when none is counted."""
-        return self.saturated / self.controls
+    inside = torch.minimum(u - box.lo, box.hi - u) / box.width
+    return float((inside <= tolerance).double().mean()) if inside.numel() else None
 
 
-class BinnedMean(Metric):
-    """Mean of absolute values in each of several bins, NaN where a bin is empty.
+def binned_mean(values: Tensor, place: Tensor, bins: int) -> Tensor:
+    """Mean of absolute values in each of several bins.
 
     Args:
-        bins: how many.
+        values: (B, ...).
+        place: bin of each row, (B,).
+        bins: how many there are.
+
+    Returns:
+        float64, (bins,); NaN where a bin is empty.
     """
-
-    full_state_update = False
-    total: Tensor
-    count: Tensor
-
-    def __init__(self, bins: int) -> None:
-        super().__init__()
-        self.add_state("total", torch.zeros(bins, dtype=torch.float64), dist_reduce_fx="sum")
-        self.add_state("count", torch.zeros(bins, dtype=torch.int64), dist_reduce_fx="sum")
-
-    def update(self, values: Tensor, place: Tensor) -> None:
-        """Add numbers.
-
-        Args:
-            values: (B, ...).
-            place: bin of each row, (B,).
-        """
-        rows = values.abs().double().flatten(1)
-        self.total.index_add_(0, place, rows.sum(-1))
-        self.count += rows.shape[-1] * torch.bincount(place, minlength=len(self.count))
-
-    def compute(self) -> Tensor:
-        """The means, (bins,)."""
-        return self.total / self.count
+    rows = values.abs().double().flatten(1)
+    total = torch.zeros(bins, dtype=torch.float64, device=rows.device).index_add(0, place, rows.sum(-1))
+    return total / (rows.shape[-1] * torch.bincount(place, minlength=bins))
 
 
 def clopper_pearson(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float] | None:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from hno.data.rows import rows_of
 from hno.data.sources import Known, Pool, make_sampler, sample_points
-from hno.evaluation.metrics import BinnedMean
+from hno.evaluation import format as text
+from hno.evaluation.metrics import binned_mean
+from hno.evaluation.sections import Column, Evaluation, ModelSection, sections
 from hno.games import Game
 from hno.losses import View
 from hno.losses.hji import HJIResidual
@@ -106,21 +108,19 @@ def _row(
 ) -> ResidualRow:
     horizon = operator.game.horizon
     place = (where.tau / horizon * bins).long().clamp(0, bins - 1)
-    physical, scaled = BinnedMean(bins), BinnedMean(bins)
     residual, scale = hji(operator, where) if len(where.tau) > 0 else (where.theta, where.theta)
-    physical.update(residual, place)
-    scaled.update(residual / scale, place)
+    scaled = residual / scale
     return ResidualRow(
         theta=theta,
         seen=theta in seen,
         region=region,
         points=len(where.tau),
-        physical=_number(physical.total.sum() / physical.count.sum()),
-        scaled=_number(scaled.total.sum() / scaled.count.sum()),
+        physical=_number(residual.abs().double().mean()),
+        scaled=_number(scaled.abs().double().mean()),
         tau=tuple(horizon * k / bins for k in range(bins + 1)),
         points_by_tau=tuple(torch.bincount(place, minlength=bins).tolist()),
-        physical_by_tau=tuple(map(_number, physical.compute())),
-        scaled_by_tau=tuple(map(_number, scaled.compute())),
+        physical_by_tau=tuple(map(_number, binned_mean(residual, place, bins))),
+        scaled_by_tau=tuple(map(_number, binned_mean(scaled, place, bins))),
     )
 
 
@@ -135,3 +135,60 @@ def hji(operator: ValueOperator, points: Points) -> tuple[Tensor, Tensor]:
 
 def _number(value: Tensor) -> float | None:
     return None if bool(value.isnan()) else float(value)
+
+
+@sections.register("residuals")
+class Residuals(ModelSection):
+    """The HJI residual by type, region and time to go."""
+
+    heading = "HJI residual"
+    note = (
+        "scaled: relative to values per horizon plus the local penalty, as in the loss; "
+        "by time to go: scaled, in equal parts of the horizon from its end"
+    )
+    columns = (
+        Column("region", "region"),
+        Column("types", "types"),
+        Column("points", "points", format=text.whole),
+        Column("physical", "mean", "1/s", text.significant),
+        Column("scaled", "scaled", format=text.significant),
+        Column("scaled_by_tau", "by time to go", format=lambda parts: ", ".join(map(text.significant, parts))),
+    )
+
+    def compute(self, evaluation: Evaluation) -> list[dict[str, Any]]:
+        """One line per type and region."""
+        seed = evaluation.condition.disturbance.seed
+        rows = residual_table(evaluation.operator, evaluation.labels, evaluation.seen, seed=seed)
+        return [row._asdict() for row in rows]
+
+    def rows(self, content: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+        """One line per region for the seen types and one for the unseen ones."""
+        groups: dict[tuple[str, bool], list[Mapping[str, Any]]] = {}
+        for row in content:
+            groups.setdefault((row["region"], row["seen"]), []).append(row)
+        regions = list(dict.fromkeys(row["region"] for row in content))
+        ordered = sorted(groups.items(), key=lambda group: (regions.index(group[0][0]), not group[0][1]))
+        return [
+            {
+                "region": region,
+                "types": f"{len(same)} {'seen' if seen else 'unseen'}",
+                "points": sum(row["points"] for row in same),
+                **{name: _weighted(same, name, "points") for name in ("physical", "scaled")},
+                "scaled_by_tau": _weighted_bins(same),
+            }
+            for (region, seen), same in ordered
+        ]
+
+
+def _weighted_bins(rows: Sequence[Mapping[str, Any]]) -> list[float | None]:
+    """Means of the scaled residual over all points of each bin."""
+    names = ("scaled_by_tau", "points_by_tau")
+    bins = [dict(zip(names, pair, strict=True)) for row in rows for pair in zip(*map(row.get, names), strict=True)]
+    count = len(rows[0]["points_by_tau"])
+    return [_weighted(bins[place::count], *names) for place in range(count)]
+
+
+def _weighted(rows: Sequence[Mapping[str, Any]], name: str, count: str) -> float | None:
+    """Mean over everything that several means are over; None where there is nothing."""
+    pairs = [(row[name], row[count]) for row in rows if row[name] is not None and row[count]]
+    return sum(value * size for value, size in pairs) / sum(size for _, size in pairs) if pairs else None

@@ -30,8 +30,8 @@ def parse_types(
     try:
         if grid and int(grid[1]) > 1:
             return game.validate_types(_lattice(game, int(grid[1])))
-        if isinstance(choice, str):
-            choice = [[float(entry) for entry in part.split(",")] for part in choice.split(";")]
+        if isinstance(choice, (str, int, float)):
+            choice = [[float(entry) for entry in part.split(",")] for part in str(choice).split(";")]
         return game.validate_types(choice)
     except (TypeError, ValueError) as error:
         reason = "" if "finite numbers" not in str(error) else f" {error}"

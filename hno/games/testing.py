@@ -44,8 +44,13 @@ def _check_attributes(game: Game) -> None:
 
 def _check_box_shapes(game: Game) -> None:
     joint, own = (game.players, game.state_dim), (game.players, game.control_dim)
-    own = own[-game.control_box.lo.dim() :]  # of one player, or of each
-    shapes = {"state_box": joint, "initial_box": joint, "control_box": own, "type_box": joint[:1]}
+    one_for_all = game.control_box.lo.dim() == 1
+    shapes = {
+        "state_box": joint,
+        "initial_box": joint,
+        "control_box": own[1:] if one_for_all else own,
+        "type_box": joint[:1],
+    }
     for name, shape in shapes.items():
         box = getattr(game, name)
         remedy = "Boxes have one row per entry of `roles`; control_box may be that of one player, if all have the same."

@@ -69,10 +69,12 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
     found = content.get(KEY) if isinstance(content, dict) else None
     if not isinstance(found, dict) or "state_dict" not in content:
         raise CheckpointError(f"{path} was not written by hno: its entry {KEY!r} is missing.")
-    if found.get("format") != FORMAT or not found.keys() >= _ENTRIES:
+    if found.get("format") != FORMAT:
         raise CheckpointError(
             f"{path} has format {found.get('format')}, this version of hno reads format {FORMAT}: train it again."
         )
+    if missing := sorted(_ENTRIES - found.keys()):
+        raise CheckpointError(f"{path} is not complete: its entry {KEY!r} lacks {', '.join(missing)}. Train it again.")
     return content
 
 

@@ -15,9 +15,10 @@ import torch
 from hno.cli import evaluate, pages, starts, train
 from hno.cli.main import main
 from hno.data import datamodule
-from hno.games import make
-from hno.operators import Architecture, Choice, make_operator
+from hno.games import Game, make
+from hno.operators import make_operator
 from hno.training.checkpoint import Provenance, record
+from tests.fakes import small_architecture
 
 SMOKE = ("experiment=smoke", "data.types=[[1,1]]", "data.workers=1", "evaluation.dt=0.1")
 """A run of seconds, on labels that every test shares."""
@@ -113,12 +114,17 @@ def refused(run: Outcome, *fragments: str) -> None:
 @pytest.fixture
 def random_checkpoint(tmp_path: Path) -> Path:
     """A narrow-road operator with random weights, as training would have saved it."""
-    torch.manual_seed(0)
-    game, small = make("narrow_road"), Architecture(network=Choice("deeponet", {"width": 16, "depth": 2}))
-    operator = make_operator(game, small)
-    weights = {f"operator.{name}": tensor for name, tensor in operator.state_dict().items()}
-    content = {"state_dict": weights, **record(game, small, Provenance("hno", [(1.0, 1.0)], 0))}
-    path = tmp_path / "random" / "last.ckpt"
+    return save_random(tmp_path / "random" / "last.ckpt")
+
+
+def save_random(path: Path, game: Game | None = None, method: str = "hno", seed: int = 0, also: float = 1.0) -> Path:
+    """An operator with random weights as training would have saved it, trained at (1, 1) and (also, also)."""
+    torch.manual_seed(seed)
+    game = game or make("narrow_road")
+    architecture = small_architecture("sin")
+    weights = make_operator(game, architecture).state_dict()
+    origin = Provenance(method, list(dict.fromkeys([(1.0, 1.0), (also, also)])), 0, "any")
     path.parent.mkdir()
-    torch.save(content, path)
+    content = {"state_dict": {f"operator.{name}": weight for name, weight in weights.items()}}
+    torch.save(content | record(game, architecture, origin), path)
     return path

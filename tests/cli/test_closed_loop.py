@@ -12,9 +12,9 @@ from torch import Tensor
 
 from hno.control.rollout import Disturbance
 from hno.data import GameData
-from hno.data.trust import safe
+from hno.data.certificates import safe
 from hno.evaluation import closed_loop
-from hno.operators import ValueOperator
+from hno.training.module import TrainingModule
 from hno.training.validation import ClosedLoopValidation, Score
 from hno.types import Batch, Extremal, Trajectory
 from tests.cli.conftest import SMOKE, Command, Outcome, refused
@@ -110,14 +110,17 @@ def test_validation_starts_of_chosen_types(command: Command, monkeypatch: pytest
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (("validation.types=grid7",), "theta must be one of grid5, grid9, or a list such as '1,1;2.5,4'; got 'grid7'"),
-        (("validation.types=default",), "theta must be one of grid5, grid9"),
+        (
+            ("validation.types=grid",),
+            "validation.types must be one of corners, gridN (as in grid5), or a list such as '1,1;2.5,4'; got 'grid'",
+        ),
+        (("validation.types=default",), "validation.types must be one of corners, gridN"),
         (("validation.types='1,1;2'",), "2 finite numbers, one per player; got [2.0]"),
         (("validation.types='1,nan'",), "2 finite numbers"),
         (("validation.types='1,inf'",), "2 finite numbers"),
-        (("validation.types=''",), "theta must be one of"),
+        (("validation.types=''",), "validation.types must be one of"),
         (("validation.types=5",), "2 finite numbers, one per player; got [5.0]"),
-        (("validation.types=[[1,1]]",), "or a list such as '1,1;2.5,4'; got [[1, 1]]"),
+        (("validation.types=[[1,1,1]]",), "2 finite numbers, one per player; got [1, 1, 1]"),
         (
             ("validation.types=grid5", "validation.starts=0"),
             "validation.starts must be a whole number of at least 1; got 0",
@@ -131,7 +134,7 @@ def test_validation_starts_of_chosen_types(command: Command, monkeypatch: pytest
         (("validation.stop=true",), "Known: seed, starts, stop_when_safe, types"),
         (("loss.hardest=0",), "loss.hardest is a share in (0, 1]; got 0"),
         (("loss.hardest=1.5",), "loss.hardest is a share in (0, 1]; got 1.5"),
-        (("sampler.rollout=-1",), "Sampler shares must be nonnegative numbers for box, band, labels, rollout"),
+        (("sampler.rollout=-1",), "Shares of the sampler's sources must be finite, not negative"),
         (("sampler=roll-out",), "Did you mean 'rollout'?"),
         (("optimizer=moun",), "Did you mean 'muon'?"),
         (("optimizer.schedule=liner",), "Did you mean 'linear'?"),
@@ -164,13 +167,13 @@ def test_a_run_ends_once_it_is_safe_if_asked(command: Command, scores: Scores, s
 
 def poisoned(monkeypatch: pytest.MonkeyPatch, step: int) -> None:
     """Let the loss be NaN from a step on."""
-    original = ValueOperator.training_step
+    original = TrainingModule.training_step
 
-    def training_step(self: ValueOperator, batch: Batch, batch_idx: int) -> Tensor:
+    def training_step(self: TrainingModule, batch: Batch, batch_idx: int) -> Tensor:
         loss = original(self, batch, batch_idx)
         return loss * torch.nan if self.global_step >= step else loss
 
-    monkeypatch.setattr(ValueOperator, "training_step", training_step)
+    monkeypatch.setattr(TrainingModule, "training_step", training_step)
 
 
 def diverged(run: Outcome, *fragments: str) -> None:
@@ -217,15 +220,15 @@ def test_another_failure_names_no_checkpoint(command: Command) -> None:
 
 def test_an_error_that_explodes_is_divergence(command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     """Finite losses, but weights that went far away between two validations."""
-    original = ValueOperator.training_step
+    original = TrainingModule.training_step
 
-    def training_step(self: ValueOperator, batch: Batch, batch_idx: int) -> Tensor:
+    def training_step(self: TrainingModule, batch: Batch, batch_idx: int) -> Tensor:
         if self.global_step == 3:
             with torch.no_grad():
-                self.net.branch.layers[-1].weight.mul_(1e4)
+                self.operator.networks[0].branch.layers[-1].weight.mul_(1e4)
         return original(self, batch, batch_idx)
 
-    monkeypatch.setattr(ValueOperator, "training_step", training_step)
+    monkeypatch.setattr(TrainingModule, "training_step", training_step)
     run = command("train", *EIGHT)
     diverged(run, "The error of costates is ", " at step 4; it was ")
     assert run.results["checkpoint"] == "best.ckpt"

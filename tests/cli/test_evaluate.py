@@ -17,10 +17,8 @@ from hno.evaluation import closed_loop
 from hno.evaluation.residuals import REGIONS
 from hno.games import Game, make
 from hno.games.base import ExtrapolationWarning
-from hno.operators import Architecture, Choice, make_operator
-from hno.training.checkpoint import Provenance, record
 from hno.types import Trajectory
-from tests.cli.conftest import SMOKE, Command, refused
+from tests.cli.conftest import SMOKE, Command, refused, save_random
 
 FAST = ("workers=1", "starts=4", "dt=0.1")
 
@@ -162,7 +160,7 @@ def test_without_a_safe_start_the_rate_is_not_applicable(command: Command, rando
     assert run.code == 0, run.text
     assert run.results["table"][0]["rate"] is None
     assert "n/a" in run.text
-    assert "No rate (n/a) at (1, 1): of 4 starts none has an equilibrium that keeps 5000 cm" in run.text
+    assert "No rate (n/a) at (1, 1): of 4 starts none has an equilibrium that keeps 50 m" in run.text
 
 
 def test_without_a_safe_start_every_section_says_so(command: Command, random_checkpoint: Path) -> None:
@@ -178,14 +176,8 @@ def test_without_a_safe_start_every_section_says_so(command: Command, random_che
 
 def other(checkpoint: Path, folder: Path, game: str = "narrow_road", seed: int = 1, **constants: float) -> Path:
     """Another operator with random weights."""
-    torch.manual_seed(seed)
-    played, small = make(game, **constants), Architecture(network=Choice("deeponet", {"width": 16, "depth": 2}))
-    weights = {f"operator.{name}": tensor for name, tensor in make_operator(played, small).state_dict().items()}
-    content = {"state_dict": weights, **record(played, small, Provenance("sno", [(1.0, 1.0), (5.0, 5.0)], seed))}
     path = checkpoint.parent.parent / folder / "last.ckpt"
-    path.parent.mkdir()
-    torch.save(content, path)
-    return path
+    return save_random(path, make(game, **constants), "sno", seed, also=5.0)
 
 
 def test_results_hold_the_configuration(command: Command, random_checkpoint: Path) -> None:
@@ -215,12 +207,13 @@ def test_robustness_is_a_section_on_request(command: Command, random_checkpoint:
     assert run.code == 0, run.text
     rows = {row["name"]: row for row in run.results["robustness"]}
     assert list(rows) == [*OmegaConf.load(config_dir() / "evaluate.yaml").conditions, "heading"]
-    assert rows["heading"]["disturbance"] == {"drift": 0.1, "components": [2]}
+    assert rows["heading"]["condition"] == {"drift": 0.1, "components": [2]}
     plain, table = rows["nominal"], run.results["table"]
     for name in ("safe_starts", "collisions"):
         assert plain[name] == sum(row[name] for row in table)
         assert [entry[name] for entry in plain["types"]] == [row[name] for row in table]
-    assert rows["belief"]["disturbance"] == {"belief": 0.5}
+    assert rows["belief"]["condition"] == {"belief": 0.5}
+    assert rows["symmetric"]["condition"] == {"symmetric": True}
     assert rows["widened"]["median_label_cost"] != plain["median_label_cost"]
     costs = [row["median_excess_cost"] for row in rows.values()]
     assert len(set(costs)) == len(costs), "every condition changes something"
@@ -260,7 +253,7 @@ def test_models_are_compared_on_the_same_starts(command: Command, random_checkpo
     for name in ("starts", "both", "only_reference", "only_other"):
         assert compared[name] == sum(pair[name] for pair in compared["types"])
     assert "random/last.ckpt" in run.text
-    assert "against random/last.ckpt" in run.text
+    assert "compared against random/last.ckpt" in run.text
 
 
 def test_every_model_meets_the_same_safe_starts(

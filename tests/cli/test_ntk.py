@@ -1,18 +1,20 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
-from omegaconf import OmegaConf
 
-from hno.cli.ntk import ntk_section, ntk_table
+from hno.evaluation.conditions import Condition
+from hno.evaluation.kernels import TangentKernel
+from hno.evaluation.sections import Evaluation
 from hno.evaluation.spectrum import spectrum, summary
 from hno.games import make
-from hno.operators import operators
+from hno.operators import make_operator
 from hno.types import Status
 from tests.cli.conftest import SMOKE, Command, refused
-from tests.fakes import fake_labels
+from tests.fakes import fake_labels, small_architecture
 
 FAST = ("workers=1", "starts=4", "dt=0.1")
 
@@ -79,19 +81,28 @@ def test_impossible_settings(command: Command, random_checkpoint: Path, override
 
 def test_a_type_without_labels_says_why() -> None:
     torch.manual_seed(0)
-    operator = operators.get("sno")(make("narrow_road"), width=8, depth=1)
-    operator.seen_types = [(1.0, 1.0), (1.0, 5.0)]
+    operator = make_operator(make("narrow_road"), small_architecture(width=8, depth=1))
     failed = fake_labels(operator.game, (1.0, 1.0), status=[Status.STALLED] * 4)
     labels = [failed, fake_labels(operator.game, (1.0, 5.0)), fake_labels(operator.game, (3.0, 3.0))]
-    section = ntk_section(operator, labels, OmegaConf.create({"ntk_rows": 40, "seed": 0}))
+    seen, types = [(1.0, 1.0), (1.0, 5.0)], [(1.0, 1.0), (1.0, 5.0), (3.0, 3.0)]
+    evaluation = Evaluation(
+        "any", operator, lambda tau, x, theta: x, seen, types, Condition(), 0.02, 0.1, {"ntk_rows": 40},
+        lambda condition: labels, labels,
+    )  # fmt: skip
+    section = TangentKernel().compute(evaluation)
     assert [(entry["theta"], entry["points"]) for entry in section] == [([1.0, 1.0], 0), ([1.0, 5.0], 2)]
     assert (section[0]["kernel"], section[0]["product"]) == (None, None)
     assert "None of 4 boundary value problems" in section[0]["reason"]
-    cells = [list(column.cells) for column in ntk_table(section).columns]
-    assert [column[0] for column in cells] == ["1, 1", "0", "J J'", *["n/a"] * 4]
+    assert shown(section)[0] == ["1, 1", "0", "J J'", *["n/a"] * 4]
+
+
+def shown(section: list[dict[str, Any]]) -> list[list[str]]:
+    """Cells of the section's table."""
+    found = TangentKernel()
+    return [[column.format(row[column.name]) for column in found.columns] for row in found.rows(section)]
 
 
 def test_a_kernel_that_is_cut_off_has_no_condition_number_in_the_table() -> None:
     rank_one = summary(spectrum(torch.ones(4, 4, dtype=torch.float64)))
-    table = ntk_table([{"theta": [1, 1], "points": 1, "kernel": rank_one, "product": rank_one}])
-    assert [next(iter(column.cells)) for column in table.columns][3:6] == ["> 1.13e+15", "1 of 4", "1.0"]
+    (first, _) = shown([{"theta": [1, 1], "points": 1, "kernel": rank_one, "product": rank_one}])
+    assert first[3:6] == ["> 1.13e+15", "1 of 4", "1.0"]

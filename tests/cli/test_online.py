@@ -1,4 +1,4 @@
-"""`python evaluate.py online=N`: the game solved while it is played, beside the learned policy."""
+"""`python evaluate.py online=N`: the learned policy beside the game solved online."""
 
 from __future__ import annotations
 
@@ -6,10 +6,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from omegaconf import OmegaConf
 from rich.console import Console
 
-from hno.cli.online import online_section, show_online
+from hno.cli.tables import show_section
+from hno.evaluation.conditions import Condition
+from hno.evaluation.online import Online
+from hno.evaluation.sections import Evaluation
 from hno.training.checkpoint import load_policy
 from tests.cli.conftest import Command, refused
 from tests.fakes import fake_labels
@@ -25,7 +27,7 @@ def test_the_game_is_solved_online_beside_the_learned_policy(command: Command, r
     one, total = online["table"]
     assert (one["theta"], total["theta"]) == ([1, 1], None)
     assert one["solver"] == total["solver"]
-    assert (one["solver"]["starts"], one["solver"]["collisions"]) == (2, 0)
+    assert (one["solver"]["safe_starts"], one["solver"]["collisions"]) == (2, 0)
     assert one["policy"]["collisions"] == 2, "random weights do not evade"
     assert one["solves"] == {"solves": 20, "searches": 0, "failures": 0}
     spent = online["latency"]
@@ -53,13 +55,24 @@ def test_impossible_settings(command: Command, random_checkpoint: Path, override
     refused(command("evaluate", f"checkpoint={random_checkpoint}", *FAST, override), message)
 
 
-def test_without_a_safe_start_nothing_is_driven(random_checkpoint: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_without_a_safe_start_nothing_is_played(random_checkpoint: Path, capsys: pytest.CaptureFixture[str]) -> None:
     policy = load_policy(random_checkpoint)
     found = fake_labels(policy.game, (1.0, 1.0), 3, clearance=[-1.0] * 3, start=torch.zeros(3, 2, 4))
-    settings = OmegaConf.create(
-        {"online": 2, "online_interval": 1, "clearance": 0.02, "dt": 0.1, "noise": 0.0, "delay": 0, "seed": 0}
+    options, types = {"online": 2, "online_interval": 1}, [(1.0, 1.0)]
+    evaluation = Evaluation(
+        "any",
+        policy.operator,
+        policy,
+        types,
+        types,
+        Condition(),
+        0.02,
+        0.1,
+        options,
+        lambda condition: [found],
+        [found],
     )
-    section = online_section(policy, [found], settings)
+    section = Online().compute(evaluation)
     assert (section["table"], section["latency"]) == ([], None)
-    show_online(section, Console())
+    show_section("online", section, {}, Console())
     assert "n/a (no start has a safe equilibrium)" in capsys.readouterr().out

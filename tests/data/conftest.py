@@ -1,14 +1,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any
 
 import pytest
 from torch import Tensor
 
-from hno.data import GameData
+from hno.data import Collocation, GameData, LabelPlan, make_sampler
 from hno.data import labels as label_data
 from hno.data.curriculum import Curriculum
 from hno.games import Game, make
@@ -17,7 +17,9 @@ from hno.types import Extremal
 from tests.fakes import fake_labels, fake_solve
 
 TYPES = ((1.0, 1.0), (5.0, 5.0), (1.0, 5.0), (2.0, 3.0))
+WIDENING = Curriculum(0, 10)
 MIXED = {"box": 0.4, "band": 0.3, "labels": 0.3}
+SIZES: Mapping[str, int | None] = {"bvp": 32, "interior": 64, "terminal": 16}
 
 MakeData = Callable[..., GameData]
 Asked = Counter[tuple[float, ...]]
@@ -40,20 +42,21 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> Asked:
 def make_data() -> MakeData:
     """A datamodule of four trajectories per type, one of them held out, on labels that were not solved."""
 
-    def build(game: Game | None = None, **changes: Any) -> GameData:
+    def build(
+        game: Game | None = None,
+        *,
+        streams: Collection[str] = ("bvp", "interior", "terminal"),
+        seed: int = 0,
+        batch_sizes: Mapping[str, int | None] = SIZES,
+        curriculum: Curriculum = WIDENING,
+        sampler: Mapping[str, float] = MIXED,
+        interior_types: str = "labelled",
+        **plan: Any,
+    ) -> GameData:
         game = game if game is not None else make("narrow_road")
-        arguments: dict[str, Any] = {
-            "streams": {"bvp", "interior", "terminal"},
-            "types": TYPES,
-            "trajectories": 3,
-            "cache": Path("unused"),
-            "seed": 0,
-            "batch_sizes": {"bvp": 32, "interior": 64, "terminal": 16},
-            "curriculum": Curriculum(0, 10),
-            "shares": MIXED,
-            "validation": 1,
-        }
-        data = GameData(game, **(arguments | changes))
+        labels = {"types": TYPES, "trajectories": 3, "validation": 1, "cache": Path("unused")} | plan
+        collocation = Collocation(make_sampler(sampler), curriculum, interior_types)
+        data = GameData(game, streams, seed, LabelPlan(**labels), collocation, batch_sizes)
         data.extremals = [fake_labels(game, theta, seed=row) for row, theta in enumerate(data.type_list)]
         data.setup("fit")
         return data

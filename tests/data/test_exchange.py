@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from hno.data import GameData
-from hno.data.curriculum import Curriculum
+from hno.data import GameData, LabelPlan
 from hno.data.exchange import REQUIRED, from_arrays, read_own, to_arrays, write_own
 from hno.data.store import LabelFileError
 from hno.games import Game, make
@@ -94,23 +93,9 @@ def test_files_are_read_for_the_game_they_were_made_for(tmp_path: Path, arrays: 
         read_own(tmp_path / "other.safetensors", game)
 
 
-def own_data(path: Path, validation: int, types: list[tuple[float, ...]], cache: Path) -> GameData:
-    sizes = {"bvp": None, "interior": 4, "terminal": 4}
-    shares = {"box": 1.0, "band": 0.0, "labels": 0.0}
-    return GameData(
-        make("narrow_road"),
-        ["bvp"],
-        types,
-        3,
-        cache,
-        0,
-        sizes,
-        Curriculum(0, 0),
-        shares,
-        "labelled",
-        validation,
-        files=[path],
-    )
+def own_data(path: Path, validation: int, cache: Path) -> GameData:
+    plan = LabelPlan(trajectories=3, validation=validation, files=[path], cache=cache)
+    return GameData(make("narrow_road"), ["bvp"], 0, plan, batch_sizes={"bvp": None})
 
 
 def test_own_labels_alone_are_trained_on_and_held_out(
@@ -120,7 +105,7 @@ def test_own_labels_alone_are_trained_on_and_held_out(
     arrays["theta"] = arrays["theta"] * 0 + 1.5
     labels = from_arrays(game, arrays)
     write_own(path, game, labels, "a test")
-    data = own_data(path, 1, [], cache)
+    data = own_data(path, 1, cache)
     data.prepare_data()
     data.setup("fit")
     assert data.type_list == [(1.5, 1.5)]
@@ -128,8 +113,4 @@ def test_own_labels_alone_are_trained_on_and_held_out(
     assert (data.train_rows.size, data.val_rows.size) == ((rows - 1) * nodes, nodes)
     torch.testing.assert_close(data.train_rows.labels.value, labels.value[:-1].flatten(0, 1).float())
     with pytest.raises(ValueError, match=rf"mine\.safetensors holds {rows} labels and {rows} are held out"):
-        own_data(path, rows, [], cache)
-    with pytest.raises(ValueError, match="no labelled types"):
-        GameData(
-            game, ["bvp"], [], 3, cache, 0, {"bvp": None}, Curriculum(0, 0), {"box": 1.0, "band": 0.0, "labels": 0.0}
-        )
+        own_data(path, rows, cache)

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from hno.data import labels as label_data
 from hno.data import shards
+from hno.data.certificates import CLEARANCE, safe
 from hno.data.labels import Progress, Request, label_set, labels_for, safe_labels_for, start_states
-from hno.data.trust import CLEARANCE, safe
 from hno.games import Game, make
 from hno.pontryagin.solve import Solver
 from hno.types import Extremal, Status

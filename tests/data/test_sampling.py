@@ -1,20 +1,23 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 import torch
-from hno.data.sampling import SOURCES, check_shares, onto_band
+from hno.data.sampling import SOURCES, onto_band
 from torch import Tensor
 
 from hno.data.curriculum import Curriculum
 from hno.data.datamodule import BOX_TYPES
+from hno.data.sources import Known, Pool, make_sampler, onto_band, sample_points
 from hno.games import Game, make
 from hno.types import Trajectory
 from tests.data.conftest import TYPES, MakeData
 
 GAMES = ("narrow_road", "lane_change", "drone")
 BASE = {"narrow_road": 1.25, "lane_change": 2.25, "drone": 0.5}
+SOURCES = ("box", "band", "labels", "rollout")
 ONLY = {name: dict.fromkeys(SOURCES, 0.0) | {name: 1.0} for name in SOURCES}
 
 
@@ -53,7 +56,7 @@ def test_band_lies_at_the_surface(make_data: MakeData, name: str) -> None:
     """Published defect 8: uniform collocation almost never meets the constraint."""
     game, sizes, share = make(name), {"bvp": 1, "interior": 2000, "terminal": 1}, {}
     for source in ("box", "band"):
-        points = make_data(game, shares=ONLY[source], batch_sizes=sizes).batch(9)["interior"].points
+        points = make_data(game, sampler=ONLY[source], batch_sizes=sizes).batch(9)["interior"].points
         gap = radius(name, points.theta) - distance(name, points.x)
         share[source] = float(((gap > -1.6) & (gap < 0.4)).float().mean())
     assert share["band"] > 0.5
@@ -64,7 +67,7 @@ def test_band_lies_at_the_surface(make_data: MakeData, name: str) -> None:
 def test_band_is_that_of_the_theta_of_each_row(make_data: MakeData, name: str) -> None:
     """With the radii of other rows the bands of small and large radii would lie at different gaps."""
     data = make_data(
-        make(name), types=[(1.0, 1.0), (5.0, 5.0)], shares=ONLY["band"],
+        make(name), types=[(1.0, 1.0), (5.0, 5.0)], sampler=ONLY["band"],
         batch_sizes={"bvp": 1, "interior": 4000, "terminal": 1},
     )  # fmt: skip
     points = data.batch(9)["interior"].points
@@ -75,7 +78,7 @@ def test_band_is_that_of_the_theta_of_each_row(make_data: MakeData, name: str) -
 
 def test_band_spreads_over_its_width(make_data: MakeData) -> None:
     game, sizes = make("narrow_road"), {"bvp": 1, "interior": 2000, "terminal": 1}
-    points = make_data(game, shares=ONLY["band"], batch_sizes=sizes).batch(9)["interior"].points
+    points = make_data(game, sampler=ONLY["band"], batch_sizes=sizes).batch(9)["interior"].points
     gap = game.constraint(points.x, points.theta).amax((-2, -1))
     assert float((gap < -1).float().mean()) > 0.1
     assert float((gap > 0).float().mean()) > 0.05
@@ -93,7 +96,7 @@ def test_onto_band_reaches_its_target() -> None:
 @pytest.mark.parametrize("source", SOURCES)
 def test_points_stay_in_the_state_box(make_data: MakeData, name: str, source: str) -> None:
     game = make(name)
-    batch = make_data(game, shares=ONLY[source]).batch(5)
+    batch = make_data(game, sampler=ONLY[source]).batch(5)
     for stream in ("interior", "terminal"):
         assert bool(game.state_box.contains(batch[stream].points.x).all())
 
@@ -101,7 +104,7 @@ def test_points_stay_in_the_state_box(make_data: MakeData, name: str, source: st
 @pytest.mark.parametrize("source", SOURCES)
 @pytest.mark.parametrize("step", [0, 3, 9, 50])
 def test_interior_times_stay_in_the_window_and_fill_it(make_data: MakeData, source: str, step: int) -> None:
-    data = make_data(shares=ONLY[source], curriculum=Curriculum(0, 10))
+    data = make_data(sampler=ONLY[source], curriculum=Curriculum(0, 10))
     tau = data.batch(step)["interior"].points.tau
     reach = min(1.0, (step + 1) / 10) * data.game.horizon
     assert float(tau.min()) >= 0
@@ -115,7 +118,7 @@ def test_terminal_points_are_at_the_end(make_data: MakeData) -> None:
 
 
 def test_labels_source_stays_near_labelled_states_of_that_time(make_data: MakeData) -> None:
-    data = make_data(shares=ONLY["labels"])
+    data = make_data(sampler=ONLY["labels"])
     points, rows, width = data.batch(4)["interior"].points, data.train_rows.points, data.game.state_box.width
     for tau, x in zip(points.tau, points.x, strict=True):
         states = rows.x[rows.tau == tau]
@@ -140,17 +143,51 @@ def test_types_of_collocation_points(make_data: MakeData) -> None:
 
 @pytest.mark.parametrize(
     "shares",
-    [{"box": -0.1, "band": 1.0}, {"box": 0.0}, {"sphere": 1.0}, {"box": math.nan}, {"box": math.inf, "band": 1.0}, {}],
+    [{"box": -0.1, "band": 1.0}, {"box": 0.0}, {"box": math.nan}, {"box": math.inf, "band": 1.0}, {"box": "half"}, {}],
 )
-def test_impossible_shares_are_refused(shares: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match="box, band, labels, rollout"):
-        check_shares(shares)
+def test_impossible_shares_are_refused(shares: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match="must be finite, not negative and not all 0; got "):
+        make_sampler(shares)
 
 
 @pytest.mark.parametrize("name", SOURCES)
 def test_every_source_can_stand_alone(name: str) -> None:
-    check_shares({name: 0.1})
-    check_shares(ONLY[name])
+    for shares in ({name: 0.1}, ONLY[name]):
+        assert list(make_sampler(shares)) == [name]
+
+
+def test_shares_are_shares_in_any_unit(make_data: MakeData) -> None:
+    parts = [make_data(sampler={"box": unit, "labels": 3 * unit}).batch(9)["interior"].points for unit in (0.25, 100)]
+    assert torch.equal(parts[0].x, parts[1].x)
+    sampler, game, theta = make_sampler({"box": 1, "labels": 3}), make("narrow_road"), torch.ones(4000, 2)
+    pool = Pool(torch.full((1,), 0.5), game.state_box.lo.unsqueeze(0))
+    drawn = sample_points(game, theta, sampler, Known(pool, None), 1.0, torch.Generator().manual_seed(0))
+    assert float((drawn.tau == 0.5).float().mean()) == pytest.approx(0.75, abs=0.03)
+
+
+def test_options_of_a_source_stand_beside_its_share() -> None:
+    game, theta = make("narrow_road"), torch.ones(2000, 2)
+    near, spreads = [], []
+    for reach, spread in ((0.5, 0.01), (3.0, 0.1)):
+        sampler = make_sampler({"band": {"share": 2, "reach": reach}, "labels": {"share": 0.0, "spread": spread}})
+        assert list(sampler) == ["band"]
+        points = sample_points(game, theta, sampler, Known(None, None), 1.0, torch.Generator().manual_seed(0))
+        gap = game.constraint(points.x, theta).amax(-1)
+        near.append(float(((gap > -0.55) & (gap < 0.15)).float().mean()))
+        around = make_sampler({"labels": {"share": 1, "spread": spread}})
+        middle = (game.state_box.lo + game.state_box.hi) / 2
+        pool = Known(Pool(torch.zeros(1), middle.unsqueeze(0)), None)
+        points = sample_points(game, theta, around, pool, 1.0, torch.Generator().manual_seed(0))
+        spreads.append(float(((points.x - middle) / game.state_box.width).std()))
+    assert near[0] > 3 * near[1] > 0, "constraint values lie in [-reach, 0.2 reach]"
+    assert spreads == pytest.approx([0.01, 0.1], rel=0.05)
+
+
+@pytest.mark.parametrize(("name", "option"), [("band", "reach"), ("labels", "spread"), ("rollout", "spread")])
+@pytest.mark.parametrize("value", [-1.0, math.nan, math.inf])
+def test_impossible_options_of_a_source_are_refused(name: str, option: str, value: float) -> None:
+    with pytest.raises(ValueError, match=f"sampler.{name}.{option} must be a"):
+        make_sampler({name: {"share": 1.0, option: value}})
 
 
 def played(game: Game, seed: int = 0, episodes: int = 3, steps: int = 10) -> Trajectory:
@@ -168,7 +205,7 @@ def times_of(game: Game, episodes: Trajectory) -> Tensor:
 @pytest.mark.parametrize("name", GAMES)
 def test_rollout_source_stays_near_visited_states_of_that_time(make_data: MakeData, name: str) -> None:
     game = make(name)
-    data, episodes = make_data(game, shares=ONLY["rollout"]), played(game)
+    data, episodes = make_data(game, sampler=ONLY["rollout"]), played(game)
     data.visit(episodes)
     times = times_of(game, episodes)
     points = data.batch(4)["interior"].points
@@ -182,7 +219,7 @@ def test_rollout_source_stays_near_visited_states_of_that_time(make_data: MakeDa
 
 
 def test_only_the_latest_episodes_are_drawn_from(make_data: MakeData) -> None:
-    data = make_data(shares=ONLY["rollout"])
+    data = make_data(sampler=ONLY["rollout"])
     game, seen = data.game, []
     for seed in (0, 1):
         episodes = played(game, seed)
@@ -195,7 +232,7 @@ def test_only_the_latest_episodes_are_drawn_from(make_data: MakeData) -> None:
 
 
 def test_before_any_validation_the_policy_is_where_the_labels_are(make_data: MakeData) -> None:
-    data = make_data(shares=ONLY["rollout"])
+    data = make_data(sampler=ONLY["rollout"])
     assert not data.visits
     points, rows, width = data.batch(4)["interior"].points, data.train_rows.points, data.game.state_box.width
     for tau, x in zip(points.tau, points.x, strict=True):
@@ -206,7 +243,7 @@ def test_before_any_validation_the_policy_is_where_the_labels_are(make_data: Mak
 
 def test_visits_touch_nothing_but_their_own_share(make_data: MakeData) -> None:
     shares = dict.fromkeys(SOURCES, 1.0)
-    before, after = make_data(shares=shares), make_data(shares=shares)
+    before, after = make_data(sampler=shares), make_data(sampler=shares)
     after.visit(played(after.game))
     old, new = before.batch(8), after.batch(8)
     assert torch.equal(old["bvp"].points.x, new["bvp"].points.x)
@@ -216,7 +253,7 @@ def test_visits_touch_nothing_but_their_own_share(make_data: MakeData) -> None:
 
 
 def test_states_that_are_not_finite_are_not_visited(make_data: MakeData) -> None:
-    data = make_data(shares=ONLY["rollout"])
+    data = make_data(sampler=ONLY["rollout"])
     episodes = played(data.game)
     x = episodes.x.clone()
     x[0, 4:], x[1, 7:, 1, 2] = torch.nan, torch.inf
@@ -234,7 +271,7 @@ def test_states_that_are_not_finite_are_not_visited(make_data: MakeData) -> None
 @pytest.mark.parametrize("step", [0, 3])
 def test_a_policy_that_breaks_at_its_start_leaves_points_to_draw(make_data: MakeData, step: int) -> None:
     """Controls that are not finite: of every episode, only the start is, which the window does not reach yet."""
-    data = make_data(shares=ONLY["rollout"], curriculum=Curriculum(0, 10))
+    data = make_data(sampler=ONLY["rollout"], curriculum=Curriculum(0, 10))
     episodes = played(data.game)
     x = episodes.x.clone()
     x[:, 1:] = torch.nan
@@ -245,7 +282,7 @@ def test_a_policy_that_breaks_at_its_start_leaves_points_to_draw(make_data: Make
 
 
 def test_visits_survive_a_checkpoint(make_data: MakeData) -> None:
-    data, resumed, fresh = (make_data(shares=ONLY["rollout"]) for _ in range(3))
+    data, resumed, fresh = (make_data(sampler=ONLY["rollout"]) for _ in range(3))
     assert data.state_dict() == {"visits": []}
     data.visit(played(data.game))
     resumed.load_state_dict(data.state_dict())

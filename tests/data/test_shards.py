@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 import torch
 
+from hno.data.certificates import summary
 from hno.data.labels import Request, label_set, labels_for, start_states
 from hno.data.shards import MANIFEST, SHARD, LabelSet
 from hno.data.store import LabelFileError, checksum
-from hno.data.trust import summary
 from hno.games import make
 from hno.types import Extremal, part
 from tests.data.conftest import Asked

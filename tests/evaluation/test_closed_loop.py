@@ -6,10 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from hno.cli.summary import remarks, show, verdict
+from hno.cli.summary import show
 from hno.control.rollout import Disturbance, rollout
-from hno.evaluation.closed_loop import TypeRow, classify, collision_table
-from hno.report.words import percent
+from hno.evaluation.closed_loop import CollisionTable, TypeRow, collision_table, verdict
 from hno.types import Extremal, Field, Points, Status
 from tests.fakes import fake_labels
 from tests.walkers import Walkers
@@ -33,42 +32,52 @@ def labelled(
     return fake_labels(Walkers(), (theta, theta), count, 0, status, clearance, starts(heights))
 
 
-def test_starts_are_safe_marginal_inevitable_or_unsolved() -> None:
-    found = labelled([0] * 7, [0.5, 0.02, 0.019, 0.001, 0.0, -0.3, 0.5], [GOOD] * 6 + [BAD])
-    safe, marginal = classify(found, clearance=0.02)
-    assert safe.tolist() == [True, True, False, False, False, False, False]
-    assert marginal.tolist() == [False, False, True, True, False, False, False]
+RESULTS = {"clearance": 0.02, "constraint_unit": "m"}
+
+
+def remarks(rows: Sequence[TypeRow]) -> list[str]:
+    """Below the table, without the totals."""
+    return CollisionTable().remarks([row.content() for row in rows], RESULTS)[1:]
 
 
 def test_every_start_is_of_one_kind_and_marginal_ones_are_apart() -> None:
     clearances = [0.5, 0.5, 0.01, 0.01, -0.2, 0.5]
     heights = [0.05, 0.9, 0.05, 0.9, 0.05, 0.05]
-    found = labelled(heights, clearances, [GOOD] * 5 + [BAD])
-    (row,) = collision_table(Walkers(), straight, [found], seen=[])
-    assert (row.starts, row.unsolved, row.inevitable, row.marginal, row.safe_starts) == (6, 1, 1, 2, 2)
-    assert row.unsolved + row.inevitable + row.marginal + row.safe_starts == row.starts
-    assert (row.collisions, row.marginal_collisions) == (1, 1)
-    assert row.rate == 0.5
-    assert row.interval == pytest.approx((0.012579, 0.987421), abs=1e-6)
+    labels = labelled(heights, clearances, [GOOD] * 5 + [BAD])
+    (row,) = collision_table(Walkers(), straight, [labels], seen=[])
+    assert (
+        row.outcome.starts,
+        row.outcome.unsolved,
+        row.outcome.inevitable,
+        row.outcome.marginal,
+        row.outcome.safe_starts,
+    ) == (6, 1, 1, 2, 2)
+    assert (
+        row.outcome.unsolved + row.outcome.inevitable + row.outcome.marginal + row.outcome.safe_starts
+        == row.outcome.starts
+    )
+    assert (row.outcome.collisions, row.outcome.marginal_collisions) == (1, 1)
+    assert row.outcome.rate == 0.5
+    assert row.outcome.interval == pytest.approx((0.012579, 0.987421), abs=1e-6)
 
 
 def test_medians_are_over_safe_starts_and_compare_with_the_label() -> None:
     heights = [0.5, 0.6, 0.7, 0.05]
     found = labelled(heights, [0.5, 0.5, 0.5, -1.0])
     (row,) = collision_table(Walkers(), straight, [found], seen=[])
-    assert row.median_min_distance == pytest.approx(1.2, abs=1e-3)
+    assert row.outcome.median_min_distance == pytest.approx(1.2, abs=1e-3)
     label_cost = -found.value[:3, 0].sum(-1)
-    assert row.median_label_cost == pytest.approx(label_cost.median().item())
+    assert row.outcome.median_label_cost == pytest.approx(label_cost.median().item())
     again = collision_table(Walkers(), straight, [found._replace(value=found.value - 50)], seen=[])
-    assert row.median_excess_cost is not None
-    assert again[0].median_excess_cost == pytest.approx(row.median_excess_cost - 100, rel=1e-6)
+    assert row.outcome.median_excess_cost is not None
+    assert again[0].outcome.median_excess_cost == pytest.approx(row.outcome.median_excess_cost - 100, rel=1e-6)
 
 
 def test_rows_keep_their_type_and_order() -> None:
     sets = [labelled([0.9] * n, [0.5] * n, theta=theta) for n, theta in ((3, 1.0), (1, 4.0), (2, 0.5))]
     rows = collision_table(Walkers(), straight, sets, seen=[(4.0, 4.0)])
     assert [row.theta for row in rows] == [(1.0, 1.0), (4.0, 4.0), (0.5, 0.5)]
-    assert [row.starts for row in rows] == [3, 1, 2]
+    assert [row.outcome.starts for row in rows] == [3, 1, 2]
     assert [row.seen for row in rows] == [False, True, False]
 
 
@@ -76,14 +85,14 @@ def test_collision_radius_is_that_of_the_rows_type() -> None:
     """Walkers miss each other by 0.6 m; the radius is 0.2 + 0.2 theta."""
     sets = [labelled([0.3], [0.5], theta=theta) for theta in (1.0, 4.0, 1.5)]
     rows = collision_table(Walkers(), straight, sets, seen=[])
-    assert [row.collisions for row in rows] == [0, 1, 0]
+    assert [row.outcome.collisions for row in rows] == [0, 1, 0]
 
 
 def test_a_broken_policy_collides_everywhere() -> None:
     found = labelled([0.9, 0.9], [0.5, 0.01])
     nothing = torch.full((2, 2), torch.nan)
     (row,) = collision_table(Walkers(), lambda tau, x, theta: nothing.expand(len(x), 2, 2), [found], seen=[])
-    assert (row.collisions, row.marginal_collisions, row.rate) == (1, 1, 1.0)
+    assert (row.outcome.collisions, row.outcome.marginal_collisions, row.outcome.rate) == (1, 1, 1.0)
 
 
 def test_medians_that_are_not_finite_do_not_exist() -> None:
@@ -94,12 +103,12 @@ def test_medians_that_are_not_finite_do_not_exist() -> None:
         return torch.tensor([[-1e20, 0.0], [0.0, 0.0]]).expand(len(x), 2, 2)
 
     (row,) = collision_table(Walkers(), violent, [found], seen=[])
-    assert (row.collisions, row.median_excess_cost, row.median_excess_costs) == (0, None, None)
-    assert row.median_label_cost is not None
-    assert row.median_min_distance is not None
+    assert (row.outcome.collisions, row.outcome.median_excess_cost, row.outcome.median_excess_costs) == (0, None, None)
+    assert row.outcome.median_label_cost is not None
+    assert row.outcome.median_min_distance is not None
     nothing = torch.full((2, 2), torch.nan)
     (row,) = collision_table(Walkers(), lambda tau, x, theta: nothing.expand(len(x), 2, 2), [found], seen=[])
-    assert (row.median_min_distance, row.distance_quantiles) == (None, None)
+    assert (row.outcome.median_min_distance, row.outcome.distance_quantiles) == (None, None)
 
 
 def test_a_disturbance_reaches_the_episodes() -> None:
@@ -113,14 +122,14 @@ def test_a_disturbance_reaches_the_episodes() -> None:
 
     def collisions(disturbance: Disturbance) -> int:
         (row,) = collision_table(Walkers(), aside, [found], [], disturbance=disturbance)
-        assert row.safe_starts == 2
-        return row.collisions
+        assert row.outcome.safe_starts == 2
+        return row.outcome.collisions
 
     assert collisions(Disturbance()) == 0
     assert collisions(Disturbance(delay=25)) == 1
 
     def distance(disturbance: Disturbance) -> float | None:
-        return collision_table(Walkers(), aside, [found], [], disturbance=disturbance)[0].median_min_distance
+        return collision_table(Walkers(), aside, [found], [], disturbance=disturbance)[0].outcome.median_min_distance
 
     assert distance(Disturbance(0.0, 0, 5)) == distance(Disturbance())
     noisy = [distance(Disturbance(0.05, 0, seed)) for seed in (1, 1, 2)]
@@ -139,14 +148,14 @@ def test_quantiles_saturation_and_own_costs_are_of_safe_starts() -> None:
         return u * (x[:, 1:, 1:] > 0.1)
 
     (row,) = collision_table(Walkers(), fast, [found], seen=[], dt=0.1)
-    assert row.distance_quantiles == pytest.approx((1.02, 1.1, 1.2), abs=2e-3)
-    assert row.distance_quantiles is not None
-    assert row.distance_quantiles[-1] == row.median_min_distance
-    assert row.saturated == pytest.approx((10 + 1 + 10) / 40)
+    assert row.outcome.distance_quantiles == pytest.approx((1.02, 1.1, 1.2), abs=2e-3)
+    assert row.outcome.distance_quantiles is not None
+    assert row.outcome.distance_quantiles[-1] == row.outcome.median_min_distance
+    assert row.outcome.saturated == pytest.approx((10 + 1 + 10) / 40)
     played = rollout(Walkers(), fast, found.x[:21, 0].float(), found.theta[:21].float(), 0.1)
     excess = -played.value.double() + found.value[:21, 0]
-    assert row.median_excess_costs == pytest.approx(excess.median(0).values.tolist())
-    assert row.median_excess_cost == pytest.approx(excess.sum(-1).median().item())
+    assert row.outcome.median_excess_costs == pytest.approx(excess.median(0).values.tolist())
+    assert row.outcome.median_excess_cost == pytest.approx(excess.sum(-1).median().item())
 
 
 def test_errors_are_weighted_over_the_nodes_of_converged_labels() -> None:
@@ -174,25 +183,21 @@ def test_without_a_value_function_or_a_label_there_are_no_errors() -> None:
         raise AssertionError("there is nothing to compare with")
 
     (row,) = collision_table(Walkers(), straight, [labelled([0.9], [0.5], [BAD])], seen=[], field=never)
-    assert (row.value_error, row.costate_error, row.saturated, row.distance_quantiles) == (None,) * 4
+    assert (row.value_error, row.costate_error, row.outcome.saturated, row.outcome.distance_quantiles) == (None,) * 4
 
 
 def test_types_outside_the_range_of_the_game_are_marked() -> None:
     sets = [labelled([0.9], [0.5], theta=theta) for theta in (0.0, 4.0, 4.5)]
     rows = collision_table(Walkers(), straight, sets, seen=[])
     assert [row.extrapolated for row in rows] == [False, False, True]
-    assert remarks([row._asdict() for row in rows], 0.02) == [
-        "Outside the types that the game is made for, results extrapolate: (4.5, 4.5)."
-    ]
+    assert remarks(rows) == ["Outside the types that the game is made for, results extrapolate: (4.5, 4.5)."]
 
 
 def test_types_outside_the_box_around_the_trained_ones_are_marked() -> None:
     sets = [labelled([0.9], [0.5], theta=theta) for theta in (0.5, 1.0, 1.5, 3.0, 4.0)]
     rows = collision_table(Walkers(), straight, sets, seen=[(1.0, 3.0), (3.0, 1.0)])
     assert [row.outside_seen for row in rows] == [True, False, False, False, True]
-    assert remarks([row._asdict() for row in rows], 0.02) == [
-        "2 of 5 types lie outside the box around the trained ones: (0.5, 0.5), (4, 4)."
-    ]
+    assert remarks(rows) == ["2 of 5 types lie outside the box around the trained ones: (0.5, 0.5), (4, 4)."]
 
 
 @pytest.fixture
@@ -202,33 +207,45 @@ def nothing_safe() -> TypeRow:
 
 
 def test_without_a_safe_start_there_is_no_rate(nothing_safe: TypeRow) -> None:
-    assert nothing_safe.safe_starts == 0
+    assert nothing_safe.outcome.safe_starts == 0
     numbers = (
         "rate", "interval", "median_min_distance", "median_excess_cost", "median_label_cost", "distance_quantiles",
-        "median_excess_costs", "saturated",
+        "largest_excess_cost", "median_excess_costs", "saturated",
     )  # fmt: skip
-    assert all(getattr(nothing_safe, name) is None for name in numbers)
+    assert all(getattr(nothing_safe.outcome, name) is None for name in numbers)
 
 
 def test_summary_says_not_applicable_and_not_zero(
     nothing_safe: TypeRow, capsys: pytest.CaptureFixture[str], tmp_path: object
 ) -> None:
     names = dict.fromkeys(("game", "operator", "activation"), "any")
-    results = {**names, "table": [nothing_safe._asdict()], "clearance": 0.02, "seconds": {}}
+    results = {**names, **RESULTS, "table": [nothing_safe.content()], "seconds": {}}
     show(results, tmp_path)
     printed = capsys.readouterr().out
     assert "n/a" in printed
     assert "0.00 %" not in printed
     assert "there is no collision rate (n/a)" in printed
-    assert "No rate (n/a) at (1, 1): of 3 starts none has an equilibrium that keeps 2 cm" in printed
+    assert "No rate (n/a) at (1, 1): of 3 starts none has an equilibrium that keeps 0.02 m" in printed
     assert "1 unsolved, 1 inevitable, 1 marginal." in " ".join(printed.split())
-    assert percent(None) == "n/a"
 
 
 def test_verdict_adds_types_and_names_the_worst(nothing_safe: TypeRow) -> None:
     sets = [labelled([0.9] * 3, [0.5] * 3), labelled([0.9, 0.05], [0.5] * 2, theta=2.0)]
     rows = [*collision_table(Walkers(), straight, sets, seen=[]), nothing_safe]
-    assert (
-        verdict([row._asdict() for row in rows]) == "1 collisions in 5 safe starts (20.00 %); worst 50.00 % at (2, 2)."
-    )
-    assert verdict([rows[0]._asdict()]) == "0 collisions in 3 safe starts (0.00 %)."
+    table = [row.content() for row in rows]
+    assert verdict(table) == "1 collision in 5 safe starts (20.00 %); worst 50.00 % at (2, 2)."
+    assert verdict(table[:1]) == "0 collisions in 3 safe starts (0.00 %)."
+
+
+def test_remarks_name_the_unit_of_the_constraint(nothing_safe: TypeRow) -> None:
+    for unit, expected in (("m", "keeps 0.5 m;"), ("", "keeps 0.5;")):
+        said = CollisionTable().remarks([nothing_safe.content()], {"clearance": 0.5, "constraint_unit": unit})
+        assert expected in said[1]
+
+
+def test_rows_in_results_hold_the_outcome_beside_the_types(nothing_safe: TypeRow) -> None:
+    content = nothing_safe.content()
+    assert list(content) == [
+        "theta", "seen", "extrapolated", "outside_seen", "value_error", "costate_error", *nothing_safe.outcome._fields,
+    ]  # fmt: skip
+    assert content["unsolved"] == nothing_safe.outcome.unsolved

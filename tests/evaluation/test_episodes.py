@@ -8,10 +8,12 @@ from torch import Tensor
 
 from hno.evaluation.closed_loop import play
 from hno.evaluation.episodes import FRAMES, episodes
+from hno.evaluation.outcome import outcome
 from hno.games import make
 from hno.games.kinematics import separation
 from hno.types import Extremal
 from tests.fakes import fake_labels
+from tests.lq import LinearQuadratic
 from tests.walkers import Walkers
 
 
@@ -91,3 +93,23 @@ def test_three_dimensions_and_the_size_of_the_file() -> None:
     kept = episodes(game, play(game, hover, found, 0.02), found, 0.02)
     assert kept["dimensions"] == 3
     assert len(json.dumps(kept)) / len(kept["episodes"]) < 8000
+
+
+def test_one_player_alone_has_episodes_without_a_radius() -> None:
+    a, b, r, q, s = (torch.full((1, 1, 1), c) for c in (0.4, 1.3, 0.7, 0.1, 0.9))
+    game = LinearQuadratic(a, b, r[..., 0], q, s)
+    found = [fake_labels(game, (0.5,), 3)]
+    played = play(game, lambda tau, x, theta: torch.zeros(len(x), 1, 1), found, 0.1)
+    kept = episodes(game, [episode._replace(clearance=torch.ones(3)) for episode in played], found, 0.02)
+    assert [episode["kind"] for episode in kept["episodes"]] == ["worst", "typical"]
+    assert kept["players"] == 1
+    assert all(episode["radius"] is None for episode in kept["episodes"])
+    assert outcome(game, found[0], played[0], 0.02).distance_quantiles is None
+
+
+def test_where_the_constraint_is_no_distance_there_is_no_radius(sets: list[Extremal]) -> None:
+    game = Walkers()
+    game.constraint_unit = ""
+    kept = episodes(game, play(game, straight, sets, 0.02), sets, 0.02)
+    assert kept["constraint_unit"] == ""
+    assert all(episode["radius"] is None for episode in kept["episodes"])

@@ -12,10 +12,10 @@ from hno.evaluation import ntk
 from hno.evaluation.ntk import jacobian, points_per_block, residuals, rows_per_point, tangent_kernels, type_kernel
 from hno.evaluation.spectrum import spectrum
 from hno.games import make
-from hno.losses import Scales
-from hno.operators import ValueOperator, operators
+from hno.losses import Scales, View, losses
+from hno.operators import ValueOperator, make_operator
 from hno.types import Labels, Points, Sample, Status, join
-from tests.fakes import fake_labels
+from tests.fakes import fake_labels, small_architecture
 
 GAMES = ("narrow_road", "lane_change", "drone")
 
@@ -23,7 +23,9 @@ GAMES = ("narrow_road", "lane_change", "drone")
 def small(game: str = "narrow_road", activation: str = "tanh", **options: Any) -> ValueOperator:
     """A small HNO with random weights whose outputs have sizes of their own."""
     torch.manual_seed(0)
-    operator = operators.get("hno")(make(game), activation, **({"width": 8, "depth": 2} | options))
+    operator = make_operator(
+        make(game), small_architecture(activation, **({"width": 8, "exact_terminal": False} | options))
+    )
     sizes = 1 + torch.arange(operator.costate_scale.numel()).view_as(operator.costate_scale) / 7
     operator.set_scales(Scales(torch.tensor(40.0), sizes))
     return operator
@@ -44,15 +46,15 @@ def double(sample: Sample) -> Sample:
 
 def training_residuals(operator: ValueOperator, sample: Sample) -> Tensor:
     """What training makes small, through the field and the loss terms of an operator in float64, (rows,)."""
-    field = operator.field(sample.points)
-    parts = [operator._residual(name, sample, field).flatten(1) for name in ("residual", "value", "costate")]
-    return torch.cat(parts, 1).flatten()
+    view = View(operator.game, sample, operator.field(sample.points), operator.field, operator.scales, 0)
+    terms = (losses.get(name)() for name in ("residual", "value", "costate"))
+    return torch.cat([(term.residual(view) / term.scale(view)).flatten(1) for term in terms], 1).flatten()
 
 
 def dense_jacobian(operator: ValueOperator, sample: Sample) -> Tensor:
     """J as torch.autograd gives it, row by row."""
     operator = copy.deepcopy(operator).double()
-    rows, parameters = training_residuals(operator, double(sample)), list(operator.net.parameters())
+    rows, parameters = training_residuals(operator, double(sample)), list(operator.parameters())
     gradients = [torch.autograd.grad(row, parameters, retain_graph=True, materialize_grads=True) for row in rows]
     return torch.stack([torch.cat([part.flatten() for part in gradient]) for gradient in gradients])
 
@@ -69,10 +71,10 @@ def test_kernel_is_that_of_the_dense_jacobian(game: str, activation: str, exact:
     operator = small(game, activation, exact_terminal=exact)
     sample = some_points(operator)
     dense = dense_jacobian(operator, sample)
-    assert dense.shape == (4 * rows_per_point(operator), sum(p.numel() for p in operator.net.parameters()))
+    assert dense.shape == (4 * rows_per_point(operator), sum(p.numel() for p in operator.parameters()))
     trunk, branch = tangent_kernels(operator, sample)
     close(trunk + branch, dense @ dense.mT)
-    split = sum(parameter.numel() for parameter in operator.net.trunk.parameters())
+    split = sum(parameter.numel() for parameter in operator.networks[0].trunk.parameters())
     close(trunk, dense[:, :split] @ dense[:, :split].mT)
     close(branch, dense[:, split:] @ dense[:, split:].mT)
 
@@ -83,7 +85,7 @@ def test_rows_are_gradients_of_what_training_makes_small(game: str, exact: bool)
     operator = small(game, exact_terminal=exact).double()
     sample = double(some_points(operator))
     assert sample.labels is not None
-    parameters = {name: tensor.detach() for name, tensor in operator.net.named_parameters(prefix="net")}
+    parameters = {name: tensor.detach() for name, tensor in operator.named_parameters()}
     found = [
         residuals(operator, parameters, Sample(Points(*point), Labels(*label)))
         for point, label in zip(zip(*sample.points, strict=True), zip(*sample.labels, strict=True), strict=True)
@@ -99,9 +101,9 @@ def test_kernel_of_a_linear_net_is_known() -> None:
     each, players = rows_per_point(operator), operator.game.players
     values = torch.tensor([each * point + players + i for point in range(3) for i in range(players)])
     net, game = copy.deepcopy(operator).double(), copy.deepcopy(operator.game).double()
-    y = net._inputs(sample.points.tau.double(), sample.points.x.double()).flatten(0, 1)
+    y = net.encoding(*map(Tensor.double, sample.points)).flatten(0, 1)
     a = game.sensors(sample.points.theta.double()).flatten(0, 1)
-    outer_trunk, outer_branch = net.net.trunk(y), net.net.branch(a)
+    outer_trunk, outer_branch = net.networks[0].trunk(y), net.networks[0].branch(a)
     close(trunk[values][:, values], (outer_branch @ outer_branch.mT * (y @ y.mT + 1)).detach())
     close(branch[values][:, values], (outer_trunk @ outer_trunk.mT * (a @ a.mT + 1)).detach())
 
@@ -188,6 +190,6 @@ def test_what_makes_no_kernel() -> None:
         type_kernel(operator, fake_labels(game), 19)
     with pytest.raises(NoLabelsError):
         type_kernel(operator, fake_labels(game, status=[Status.STALLED] * 4), 200)
-    operator.net.trunk.activation.slope.data.fill_(float("nan"))
+    operator.networks[0].trunk.activation.slope.data.fill_(float("nan"))
     with pytest.raises(ValueError, match="diverged"):
         type_kernel(operator, fake_labels(game), 40)

@@ -12,13 +12,13 @@ import torch
 from scipy.integrate import solve_ivp
 from torch import Tensor
 
-from hno.evaluation.residuals import REGIONS, ResidualRow, hji, residual_table
+from hno.evaluation.residuals import REGIONS, ResidualRow, Residuals, hji, residual_table
 from hno.games import Game, make
-from hno.losses import Scales
+from hno.losses import Scales, View
 from hno.losses.hji import HJIResidual
-from hno.operators import ValueOperator, operators
-from hno.types import Field, Points, Sample, Status
-from tests.fakes import fake_labels
+from hno.operators import ValueOperator, make_operator
+from hno.types import Field, Points, Sample, Status, Types
+from tests.fakes import fake_labels, small_architecture
 from tests.lq import LinearQuadratic
 
 AB, RQS = (0.4, 1.3), (0.7, 1.1, 0.9)
@@ -42,14 +42,14 @@ def riccati(error: Callable[[Tensor], tuple[Tensor, Tensor]]) -> ValueOperator:
         rate = q + 2 * a * p - b**2 * p**2 / r
         return Field(-p * x**2 + more, -rate * x**2 + slope, (-2 * p * x)[..., None, None])
 
-    scales = {"value_scale": torch.tensor(2.0), "costate_scale": torch.ones(1, 1, 1)}
-    fake: Any = SimpleNamespace(game=one_player(), field=field, seen_types=[(0.5,)], **scales)
+    scales = Scales(torch.tensor(2.0), torch.ones(1, 1, 1))
+    fake: Any = SimpleNamespace(game=one_player(), field=field, scales=scales)
     return fake
 
 
 def table(operator: ValueOperator, **options: int) -> list[ResidualRow]:
     labels = [fake_labels(operator.game, (0.5,), 6), fake_labels(operator.game, (0.25,), 6)]
-    return residual_table(operator, labels, **{"points": 256, **options})
+    return residual_table(operator, labels, [(0.5,)], **{"points": 256, **options})
 
 
 def test_an_exact_value_has_no_residual_anywhere() -> None:
@@ -81,24 +81,25 @@ def test_bins_are_of_time_to_go() -> None:
 @pytest.fixture
 def operator() -> ValueOperator:
     torch.manual_seed(0)
-    built = operators.get("hno")(make("narrow_road"), width=16, depth=2).eval().requires_grad_(False)
+    built = make_operator(make("narrow_road"), small_architecture()).eval().requires_grad_(False)
     built.set_scales(Scales(torch.tensor(20.0), torch.ones(2, 2, 4)))
-    built.seen_types = [(1.0, 1.0)]
     return built
+
+
+SEEN = [(1.0, 1.0)]
 
 
 def test_means_are_those_of_the_loss_term(operator: ValueOperator) -> None:
     game, found = operator.game, fake_labels(make("narrow_road"), (2.0, 3.0), 5)
-    row = residual_table(operator, [found])[-1]
+    row = residual_table(operator, [found], [])[-1]
     nodes = len(found.t)
     points = Points(
         (game.horizon - found.t).float().repeat(5),
         found.x.flatten(0, 1).float(),
         torch.tensor([[2.0, 3.0]] * 5 * nodes),
     )
-    term = HJIResidual()
-    residual = term.residual(game, Sample(points), operator.field(points))
-    scale = term.scale(game, Sample(points), Scales(operator.value_scale, operator.costate_scale))
+    view = View(game, Sample(points), operator.field(points), operator.field, operator.scales, 0)
+    residual, scale = HJIResidual().residual(view), HJIResidual().scale(view)
     assert row.points == 5 * nodes
     assert row.physical == pytest.approx(residual.abs().mean().item(), rel=1e-5)
     assert row.scaled == pytest.approx((residual / scale).abs().mean().item(), rel=1e-5)
@@ -106,7 +107,7 @@ def test_means_are_those_of_the_loss_term(operator: ValueOperator) -> None:
 
 
 def test_bins_make_up_the_whole(operator: ValueOperator) -> None:
-    for row in residual_table(operator, [fake_labels(operator.game, (2.0, 3.0), 5)], points=500, bins=3):
+    for row in residual_table(operator, [fake_labels(operator.game, (2.0, 3.0), 5)], [], points=500, bins=3):
         assert sum(row.points_by_tau) == row.points
         for whole, parts in ((row.physical, row.physical_by_tau), (row.scaled, row.scaled_by_tau)):
             total = sum((part or 0) * count for part, count in zip(parts, row.points_by_tau, strict=True))
@@ -117,12 +118,12 @@ def test_points_lie_in_their_regions(operator: ValueOperator, monkeypatch: pytes
     game, asked = operator.game, list[Points]()
     original = operator.field
 
-    def field(points: Points) -> Field:
+    def field(points: Points, types: Types | None = None) -> Field:
         asked.append(points)
         return original(points)
 
     monkeypatch.setattr(operator, "field", field)
-    residual_table(operator, [fake_labels(game, (2.0, 3.0), 5)], points=2000)
+    residual_table(operator, [fake_labels(game, (2.0, 3.0), 5)], [], points=2000)
     start, box, band, around, along = asked
     assert bool(game.initial_box.contains(start.x).all())
     assert bool((start.tau == game.horizon).all())
@@ -136,16 +137,16 @@ def test_points_lie_in_their_regions(operator: ValueOperator, monkeypatch: pytes
 
 def test_rows_depend_on_the_seed_and_not_on_other_types(operator: ValueOperator) -> None:
     sets = [fake_labels(operator.game, theta, 4) for theta in ((1.0, 1.0), (4.0, 2.0))]
-    both = residual_table(operator, sets, points=64, seed=3)
-    assert both[len(REGIONS) :] == residual_table(operator, sets[1:], points=64, seed=3)
-    other = residual_table(operator, sets, points=64, seed=4)
+    both = residual_table(operator, sets, [], points=64, seed=3)
+    assert both[len(REGIONS) :] == residual_table(operator, sets[1:], [], points=64, seed=3)
+    other = residual_table(operator, sets, [], points=64, seed=4)
     changed = [one.physical != two.physical for one, two in zip(both, other, strict=True)]
     assert changed == [True, True, True, True, False] * 2
 
 
 def test_labels_of_which_none_converged_are_no_region(operator: ValueOperator) -> None:
     found = fake_labels(operator.game, (1.0, 1.0), 3, status=[Status.STALLED] * 3)
-    rows = residual_table(operator, [found], points=16)
+    rows = residual_table(operator, [found], [], points=16)
     assert [row.points for row in rows] == [16, 16, 16, 0, 0]
     for row in rows[3:]:
         assert (row.physical, row.scaled) == (None, None)
@@ -156,12 +157,30 @@ def test_only_converged_labels_are_looked_at(operator: ValueOperator) -> None:
     found = fake_labels(operator.game, (1.0, 1.0), 3)
     broken = found._replace(x=found.x.clone(), status=torch.tensor([0, int(Status.NOT_FINITE), 0]))
     broken.x[1] = math.nan
-    row = residual_table(operator, [broken], points=16)[-1]
+    row = residual_table(operator, [broken], [], points=16)[-1]
     assert row.points == 2 * len(found.t)
     assert row.physical is not None
 
 
 def test_the_game_stays_as_it_is(operator: ValueOperator) -> None:
     before: Game = make("narrow_road")
-    residual_table(operator, [fake_labels(operator.game, (1.0, 1.0), 2)], points=16)
+    residual_table(operator, [fake_labels(operator.game, (1.0, 1.0), 2)], [], points=16)
     assert operator.game.fingerprint() == before.fingerprint()
+
+
+def test_means_over_types_are_those_over_their_points() -> None:
+    """A residual of tau itself: weights are points, region by region and bin by bin."""
+    rows = table(riccati(lambda tau: (tau**2 / 2, tau)))
+    shown = Residuals().rows([row._asdict() for row in rows])
+    assert [(row["region"], row["types"]) for row in shown] == [
+        (region, f"1 {kind}") for region in REGIONS for kind in ("seen", "unseen")
+    ]
+    unseen = [row._replace(seen=False, points=3 * row.points, physical=5.0) for row in rows[: len(REGIONS)]]
+    pooled = Residuals().rows([row._asdict() for row in (*unseen, *rows[len(REGIONS) :])])
+    for one, other, both in zip(unseen, rows[len(REGIONS) :], pooled, strict=True):
+        assert (both["types"], both["points"]) == ("2 unseen", one.points + other.points)
+        assert both["physical"] == pytest.approx((3 * 5.0 + other.physical) / 4)
+        for place, mean in enumerate(both["scaled_by_tau"]):
+            assert (
+                mean == pytest.approx(other.scaled_by_tau[place], rel=0.2) if other.points_by_tau[place] else not mean
+            )

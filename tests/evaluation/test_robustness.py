@@ -9,10 +9,11 @@ import torch
 from rich.console import Console
 from torch import Tensor
 
-from hno.cli.tables import show_robustness
+from hno.cli.tables import show_section
 from hno.control.rollout import Disturbance
 from hno.evaluation.closed_loop import collision_table
-from hno.evaluation.robustness import Condition, read_conditions, robustness_table
+from hno.evaluation.conditions import Condition, read_conditions
+from hno.evaluation.robustness import robustness_table
 from hno.games import make
 from hno.types import Extremal
 from tests.fakes import fake_labels
@@ -33,24 +34,25 @@ SETS = [labelled([0.9, 0.05, 0.8]), labelled([0.9, 0.7], theta=2.0)]
 
 
 def test_the_undisturbed_line_repeats_the_collision_table() -> None:
-    (row,) = robustness_table(Walkers(), straight, [Condition("nothing")], lambda widen: SETS, 0.02, 0.02)
+    (row,) = robustness_table(Walkers(), straight, [Condition("nothing")], lambda condition: SETS, 0.02, 0.02)
     table = collision_table(Walkers(), straight, SETS, [])
-    assert (row.safe_starts, row.collisions, row.rate) == (5, 1, 0.2)
+    assert (row.outcome.safe_starts, row.outcome.collisions, row.outcome.rate) == (5, 1, 0.2)
     assert row.types == [
-        {"theta": entry.theta, "safe_starts": entry.safe_starts, "collisions": entry.collisions} for entry in table
+        {"theta": entry.theta, "safe_starts": entry.outcome.safe_starts, "collisions": entry.outcome.collisions}
+        for entry in table
     ]
-    assert row.interval is not None
-    assert row.interval[0] < 0.2 < row.interval[1]
+    assert row.outcome.interval is not None
+    assert row.outcome.interval[0] < 0.2 < row.outcome.interval[1]
     label_costs = torch.cat([-found.value[:, 0].sum(-1) for found in SETS])
-    assert row.median_label_cost == label_costs.median().item()
+    assert row.outcome.median_label_cost == label_costs.median().item()
 
 
 def test_every_condition_plays_the_labels_of_its_width_and_its_own_disturbance() -> None:
     asked: list[float] = []
 
-    def labels_of(widen: float) -> list[Extremal]:
-        asked.append(widen)
-        return [labelled([0.9] * (3 if widen == 1 else 4))]
+    def labels_of(condition: Condition) -> list[Extremal]:
+        asked.append(condition.widen)
+        return [labelled([0.9] * (3 if condition.widen == 1 else 4))]
 
     conditions = [
         Condition("plain"),
@@ -59,25 +61,32 @@ def test_every_condition_plays_the_labels_of_its_width_and_its_own_disturbance()
     ]
     plain, wide, pushed = robustness_table(Walkers(), straight, conditions, labels_of, 0.02, 0.1)
     assert asked == [1.0, 2.0, 1.0]
-    assert (plain.safe_starts, wide.safe_starts, pushed.safe_starts) == (3, 4, 3)
-    assert (plain.disturbance, wide.disturbance, pushed.disturbance) == ({}, {}, {"drift": 0.4})
-    assert plain.median_excess_cost != pushed.median_excess_cost
+    assert (plain.outcome.safe_starts, wide.outcome.safe_starts, pushed.outcome.safe_starts) == (3, 4, 3)
+    assert [row.content()["condition"] for row in (plain, wide, pushed)] == [{}, {"widen": 2.0}, {"drift": 0.4}]
+    assert plain.outcome.median_excess_cost != pushed.outcome.median_excess_cost
 
 
 def test_without_safe_starts_there_are_no_rates() -> None:
     nothing = [labelled([0.9, 0.05], clearance=-1.0)]  # the second one collides, as its equilibrium does
-    (row,) = robustness_table(Walkers(), straight, [Condition("any")], lambda widen: nothing, 0.02, 0.1)
-    assert (row.safe_starts, row.collisions) == (0, 0)
-    assert (row.rate, row.interval, row.median_excess_cost, row.median_label_cost) == (None, None, None, None)
+    (row,) = robustness_table(Walkers(), straight, [Condition("any")], lambda condition: nothing, 0.02, 0.1)
+    assert (row.outcome.safe_starts, row.outcome.collisions) == (0, 0)
+    found = row.outcome
+    assert (found.rate, found.interval, found.median_excess_cost, found.median_label_cost) == (None,) * 4
 
 
 def test_entries_replace_those_of_the_table() -> None:
-    base = Condition("", 1.5, Disturbance(noise=0.1, delay=1, seed=7))
-    content = {"same": {}, "wide": {"widen": 2}, "wind": {"drift": 0.1, "components": [0, 1], "noise": 0}}
+    base = Condition("", 1.5, disturbance=Disturbance(noise=0.1, delay=1, seed=7))
+    content = {
+        "same": {},
+        "wide": {"widen": 2},
+        "alike": {"symmetric": True},
+        "wind": {"drift": 0.1, "components": [0, 1], "noise": 0},
+    }
     assert read_conditions(make("narrow_road"), content, base) == [
-        Condition("same", 1.5, base.disturbance),
-        Condition("wide", 2.0, base.disturbance),
-        Condition("wind", 1.5, Disturbance(0, 1, 7, drift=0.1, components=(0, 1))),
+        Condition("same", 1.5, disturbance=base.disturbance),
+        Condition("wide", 2.0, disturbance=base.disturbance),
+        Condition("alike", 1.5, True, base.disturbance),
+        Condition("wind", 1.5, disturbance=Disturbance(0, 1, 7, drift=0.1, components=(0, 1))),
     ]
 
 
@@ -95,6 +104,7 @@ def test_entries_replace_those_of_the_table() -> None:
         ({"a": {"belief": True}}, "conditions.a.belief must be a finite number"),
         ({"a": {"delay": 0.5}}, "conditions.a.delay must be a whole number"),
         ({"a": {"widen": 0}}, "conditions.a.widen must be a positive number; got 0"),
+        ({"a": {"symmetric": 1}}, "conditions.a.symmetric must be true or false; got 1"),
         ({"a": {"components": 2}}, "conditions.a.components must be a list of places"),
         ({"a": {"components": [4]}}, r"0 to 3; got \[4\]"),
     ],
@@ -108,5 +118,5 @@ def test_without_a_collision_no_type_is_the_worst(capsys: pytest.CaptureFixture[
     for heights, worst in (([0.9, 0.8], "none"), ([0.9, 0.05], "1 of 2 at (1, 1)")):
         labels = [labelled(heights)]
         rows = robustness_table(Walkers(), straight, [Condition("all")], lambda _, labels=labels: labels, 0.02, 0.1)
-        show_robustness([row._asdict() for row in rows], Console(width=140))
+        show_section("robustness", [row.content() for row in rows], {}, Console(width=140))
         assert worst in capsys.readouterr().out

@@ -8,9 +8,11 @@ from torch import nn
 
 from hno.operators import activations
 from hno.operators.deeponet import MLP, DeepONet
+from hno.operators.network import Inputs
 from tests.operators.conftest import ACTIVATIONS
 
-PLAIN = {"tanh": torch.tanh, "relu": torch.relu, "sin": lambda z: torch.sin(30 * z)}
+INPUTS = Inputs(ego=5, other=4, others=1, role=0, sensors=50)
+PLAIN = {"tanh": torch.tanh, "relu": torch.relu, "sin": lambda z: torch.sin(10 * z)}
 
 
 @pytest.mark.parametrize("name", ACTIVATIONS)
@@ -50,7 +52,7 @@ def test_relu_weights_are_kaiming(layer: nn.Linear) -> None:
     assert not layer.bias.any()
 
 
-@pytest.mark.parametrize(("first", "bound"), [(True, 1 / 300), (False, math.sqrt(6 / 300) / 30)])
+@pytest.mark.parametrize(("first", "bound"), [(True, 1 / 300), (False, math.sqrt(6 / 300) / 10)])
 def test_sin_weights_are_uniform_within_the_siren_bounds(layer: nn.Linear, first: bool, bound: float) -> None:
     activations.get("sin")().init_(layer, first=first)
     weights = layer.weight.flatten()
@@ -64,7 +66,7 @@ def test_sin_keeps_the_size_of_phases_through_the_layers() -> None:
     torch.manual_seed(0)
     net, phases = MLP((16, 256, 256, 256, 256), activations.get("sin")()), []
     for layer in net.layers[1:]:
-        layer.register_forward_hook(lambda module, arguments, output: phases.append(30 * output))
+        layer.register_forward_hook(lambda module, arguments, output: phases.append(10 * output))
     net(2 * torch.rand(500, 16) - 1)
     assert [phase.std().item() for phase in phases] == pytest.approx([1.0] * 3, rel=0.25)
 
@@ -78,7 +80,7 @@ def test_relu_and_tanh_signals_neither_vanish_nor_explode(name: str) -> None:
 
 @pytest.mark.parametrize("name", ACTIVATIONS)
 def test_one_slope_for_the_trunk_and_one_for_the_branch(name: str) -> None:
-    net = DeepONet(9, 50, name)
+    net = DeepONet(INPUTS, activations.get(name))
     slopes = [parameter for key, parameter in net.named_parameters() if key.endswith("slope")]
     assert len(slopes) == 2
     assert slopes[0].data_ptr() != slopes[1].data_ptr()
@@ -88,7 +90,7 @@ def test_one_slope_for_the_trunk_and_one_for_the_branch(name: str) -> None:
 
 
 def test_four_hidden_layers_of_64() -> None:
-    net = DeepONet(9, 50, "tanh")
+    net = DeepONet(INPUTS, activations.get("tanh"))
     shapes = [tuple(layer.weight.shape) for layer in net.trunk.layers]
     assert shapes == [(64, 9), (64, 64), (64, 64), (64, 64), (64, 64)]
     assert tuple(net.branch.layers[0].weight.shape) == (64, 50)

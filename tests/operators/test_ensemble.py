@@ -2,32 +2,25 @@
 
 from __future__ import annotations
 
-import copy
 import itertools
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from torch import nn
 
 from hno.operators import ValueOperator
-from hno.operators.deeponet import DeepONet, nets
-from hno.training.checkpoint import load_operator
+from hno.training.checkpoint import Provenance, load_operator, record
 from hno.types import Batch, Field, Labels, Points, Sample
-from tests.operators.conftest import GAMES, MakeOperator, random_points
+from tests.operators.conftest import GAMES, MakeModule, MakeOperator, architecture, module_of, random_points
 
 
-def alone(make_operator: MakeOperator, net: DeepONet, game: str = "narrow_road", **options: Any) -> ValueOperator:
+def alone(make_operator: MakeOperator, network: nn.Module, game: str = "narrow_road", **options: Any) -> ValueOperator:
     """The operator of one member."""
     single = make_operator(game, **options).double()
-    single.net = copy.deepcopy(net)
-    silence(single)
+    single.networks[0].load_state_dict(network.state_dict())
     return single
-
-
-def silence(operator: ValueOperator) -> None:
-    """Let it log nothing: there is no trainer to log to."""
-    operator.log_dict = operator.log = lambda *_, **__: None  # type: ignore[assignment, method-assign]
 
 
 def labelled(points: Points) -> Sample:
@@ -43,7 +36,7 @@ def labelled(points: Points) -> Sample:
 def test_the_operator_is_the_median_of_its_members(make_operator: MakeOperator, game: str, exact: bool) -> None:
     operator = make_operator(game, members=3, exact_terminal=exact).double()
     points = Points(*(part.double() for part in random_points(operator.game, 9)))
-    singles = [alone(make_operator, net, game, exact_terminal=exact) for net in nets(operator.net)]
+    singles = [alone(make_operator, net, game, exact_terminal=exact) for net in operator.networks]
     fields = [single.field(points) for single in singles]
     for part, members in zip(operator.field(points), zip(*fields, strict=True), strict=True):
         torch.testing.assert_close(part, torch.stack(members).median(0).values)
@@ -55,46 +48,44 @@ def test_the_operator_is_the_median_of_its_members(make_operator: MakeOperator, 
 def test_one_member_that_errs_changes_little(make_operator: MakeOperator) -> None:
     operator = make_operator(members=3)
     points = random_points(operator.game, 50)
-    _, *others = (alone(make_operator, net).float().field(points) for net in nets(operator.net))
+    _, *others = (alone(make_operator, net).float().field(points) for net in operator.networks)
     with torch.no_grad():
-        for weights in nets(operator.net)[0].parameters():
+        for weights in operator.networks[0].parameters():
             weights.mul_(100)
     for part, pair in zip(operator.field(points), zip(*others, strict=True), strict=True):
         low, high = torch.stack(pair).aminmax(dim=0)
         assert bool(((part >= low) & (part <= high)).all())
 
 
-@pytest.mark.parametrize("name", ["hno", "sno"])
+@pytest.mark.parametrize("method", ["hno", "sno"])
 def test_every_member_is_trained_along_the_gradient_that_it_would_have_alone(
-    make_operator: MakeOperator, name: str
+    make_module: MakeModule, make_operator: MakeOperator, method: str
 ) -> None:
-    operator = make_operator("lane_change", name, members=3).double()
-    silence(operator)
-    points = Points(*(part.double() for part in random_points(operator.game, 12)))
+    module = make_module("lane_change", method, members=3).double()
+    points = Points(*(part.double() for part in random_points(module.operator.game, 12)))
     end = Sample(points._replace(tau=torch.zeros_like(points.tau)))
     batch: Batch = {"bvp": labelled(points), "interior": Sample(points), "terminal": end}
-    operator.training_step(batch, 0).backward()
-    for net in nets(operator.net):
-        single = alone(make_operator, net, "lane_change", name=name)
-        single.zero_grad()
+    module.training_step(batch, 0).backward()
+    for network in module.operator.networks:
+        single = module_of(alone(make_operator, network, "lane_change"), method)
         single.training_step(batch, 0).backward()
-        for mine, own in zip(net.parameters(), single.net.parameters(), strict=True):
+        for mine, own in zip(network.parameters(), single.operator.parameters(), strict=True):
             assert mine.grad is not None
             torch.testing.assert_close(3 * mine.grad, own.grad)
 
 
 def test_the_first_member_starts_where_a_single_net_starts(make_operator: MakeOperator) -> None:
-    first, single = nets(make_operator(members=3).net)[0], make_operator().net
+    first, single = make_operator(members=3).networks[0], make_operator().networks[0]
     assert all(map(torch.equal, first.parameters(), single.parameters()))
 
 
 def test_a_checkpoint_keeps_every_member(make_operator: MakeOperator, tmp_path: Path) -> None:
     operator = make_operator("drone", members=3)
-    saved = {"state_dict": operator.state_dict()}
-    operator.on_save_checkpoint(saved)
-    torch.save(saved, tmp_path / "last.ckpt")
+    weights = {f"operator.{name}": weight for name, weight in operator.state_dict().items()}
+    entries = record(operator.game, architecture(members=3), Provenance())
+    torch.save(entries | {"state_dict": weights}, tmp_path / "last.ckpt")
     points = random_points(operator.game)
-    loaded: Field = load_operator(tmp_path / "last.ckpt").field(points)
+    loaded: Field = load_operator(tmp_path / "last.ckpt")[0].field(points)
     assert all(map(torch.equal, loaded, operator.field(points)))
 
 

@@ -4,16 +4,15 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from copy import deepcopy
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 from torch import Tensor, nn
 
 from hno.operators.inputs import distinct_types, ego_views, tables
-from hno.training.checkpoint import CheckpointError, check_resumable, load_operator
+from hno.training.checkpoint import CheckpointError, Provenance, check_resumable, load_operator, record
 from hno.types import Field, Labels, Points, Sample, Types
-from tests.operators.conftest import ACTIVATIONS, GAMES, MakeOperator, random_points
+from tests.operators.conftest import ACTIVATIONS, GAMES, MakeOperator, architecture, random_points
 
 
 @pytest.mark.parametrize("game", GAMES)
@@ -99,15 +98,15 @@ def test_an_exact_end_leaves_the_rest_to_the_net(make_operator: MakeOperator, ga
 
 def test_an_exact_end_travels_with_the_checkpoint(make_operator: MakeOperator, tmp_path: Path) -> None:
     operator = make_operator("lane_change", exact_terminal=True)
-    content: dict[str, Any] = {"state_dict": operator.state_dict()}
-    operator.on_save_checkpoint(content)
-    torch.save(content, tmp_path / "last.ckpt")
+    content = record(operator.game, architecture(exact_terminal=True), Provenance())
+    weights = {f"operator.{name}": weight for name, weight in operator.state_dict().items()}
+    torch.save(content | {"state_dict": weights}, tmp_path / "last.ckpt")
     points = random_points(operator.game)
     with torch.no_grad():
         expected = operator.field(points)
-    assert all(map(torch.equal, load_operator(tmp_path / "last.ckpt").field(points), expected))
-    with pytest.raises(CheckpointError, match="options"):
-        check_resumable(tmp_path / "last.ckpt", make_operator("lane_change"))
+    assert all(map(torch.equal, load_operator(tmp_path / "last.ckpt")[0].field(points), expected))
+    with pytest.raises(CheckpointError, match="exact_terminal"):
+        check_resumable(tmp_path / "last.ckpt", record(operator.game, architecture(), Provenance()))
 
 
 @pytest.mark.parametrize("quiet", [torch.no_grad, torch.inference_mode])
@@ -217,7 +216,7 @@ def inputs_of(net: nn.Module, seen: list[Tensor]) -> None:
 @pytest.mark.parametrize("types", [1, 3, 12])
 def test_branch_runs_once_per_distinct_theta(make_operator: MakeOperator, types: int) -> None:
     operator, seen = make_operator(), []
-    inputs_of(operator.net.branch, seen)
+    inputs_of(operator.networks[0].branch, seen)
     points = random_points(operator.game, 12, types=types)
     operator.field(points)
     assert [len(inputs) for inputs in seen] == [types * operator.game.players]
@@ -225,8 +224,8 @@ def test_branch_runs_once_per_distinct_theta(make_operator: MakeOperator, types:
 
 def test_branch_sees_the_sensors_of_each_row(make_operator: MakeOperator) -> None:
     operator, sensors, rows = make_operator(), [], []
-    inputs_of(operator.net.branch, sensors)
-    operator.net.register_forward_pre_hook(lambda module, arguments: rows.append(arguments[2]))
+    inputs_of(operator.networks[0].branch, sensors)
+    operator.networks[0].register_forward_pre_hook(lambda module, arguments: rows.append(arguments[2]))
     points = random_points(operator.game, 10, types=4)
     operator(*points)
     fed = sensors[0][rows[0]].unflatten(0, (10, 2))
@@ -236,7 +235,7 @@ def test_branch_sees_the_sensors_of_each_row(make_operator: MakeOperator) -> Non
 @pytest.mark.parametrize("game", GAMES)
 def test_state_box_and_horizon_map_to_the_unit_box_exactly(make_operator: MakeOperator, game: str) -> None:
     operator, seen = make_operator(game), []
-    inputs_of(operator.net.trunk, seen)
+    inputs_of(operator.networks[0].trunk, seen)
     box, size = operator.game.state_box, operator.game.players * operator.game.state_dim
     tau = torch.tensor([0.0, operator.game.horizon])
     operator(tau, torch.stack([box.lo, box.hi]), torch.ones(2, 2))
@@ -248,7 +247,7 @@ def test_role_is_an_input_only_where_players_differ(make_operator: MakeOperator)
     seen: dict[str, list[Tensor]] = {}
     for game in GAMES:
         operator = make_operator(game)
-        inputs_of(operator.net.trunk, seen.setdefault(game, []))
+        inputs_of(operator.networks[0].trunk, seen.setdefault(game, []))
         operator(*random_points(operator.game, 3))
     widths = {game: inputs[0].shape[-1] for game, inputs in seen.items()}
     assert widths == {"narrow_road": 9, "lane_change": 10, "drone": 13}
@@ -276,8 +275,9 @@ def test_field_works_where_gradients_are_switched_off(make_operator: MakeOperato
 def test_field_is_differentiable_in_the_weights_on_request(make_operator: MakeOperator) -> None:
     operator = make_operator()
     field = operator.field(random_points(operator.game))
+    weight = operator.networks[0].trunk.layers[0].weight
     for part in field:
-        (slope,) = torch.autograd.grad(part.square().sum(), operator.net.trunk.layers[0].weight, retain_graph=True)
+        (slope,) = torch.autograd.grad(part.square().sum(), weight, retain_graph=True)
         assert bool(slope.any())
 
 

@@ -14,9 +14,10 @@ from hno.losses import hji_residual
 from hno.operators import ValueOperator, activations
 from hno.operators import value_gradient as module
 from hno.operators.deeponet import DeepONet
+from hno.operators.network import Inputs
 from hno.operators.value_gradient import Kernels, Layer, compiled, value_gradient
 from hno.types import Batch, Field, Labels, Points, Sample
-from tests.operators.conftest import ACTIVATIONS, GAMES, MakeOperator, random_points
+from tests.operators.conftest import ACTIVATIONS, GAMES, MakeModule, MakeOperator, random_points
 
 TIGHT = {"rtol": 1e-11, "atol": 1e-11}
 
@@ -181,7 +182,7 @@ def test_mixed_precision_trains(make_operator: MakeOperator, activation: str) ->
     with torch.autocast("cpu", dtype=torch.bfloat16):
         field = operator.field(points)
         loss = torch.stack([part.float().abs().mean() for part in field]).sum()
-    slopes = torch.autograd.grad(loss, list(operator.net.parameters()), allow_unused=True)
+    slopes = torch.autograd.grad(loss, list(operator.parameters()), allow_unused=True)
     assert all(slope.dtype == torch.float32 and bool(slope.isfinite().all()) for slope in slopes if slope is not None)
     assert bool(slopes[1].any())
 
@@ -329,7 +330,7 @@ def test_without_a_compiler_nothing_is_compiled(
 def test_a_net_folds_its_activations_away(activation: str) -> None:
     """Gain, shift and slope go into the weights, and their derivatives come back to the parameters."""
     torch.manual_seed(0)
-    net = DeepONet(4, 3, activation, width=6, depth=3).double()
+    net = DeepONet(Inputs(2, 2, 1, 0, 3), activations.get(activation), width=6, depth=3).double()
     with torch.no_grad():
         for parameter in net.parameters():
             parameter.mul_(1.1).add_(0.013)
@@ -380,12 +381,11 @@ def plain_loss(operator: ValueOperator, batch: Batch, weights: Mapping[str, floa
 @pytest.mark.parametrize("game", GAMES)
 @pytest.mark.parametrize("exact", [False, True])
 def test_training_step_has_the_gradients_of_a_plain_reference(
-    make_operator: MakeOperator, monkeypatch: pytest.MonkeyPatch, activation: str, game: str, exact: bool
+    make_module: MakeModule, activation: str, game: str, exact: bool
 ) -> None:
-    monkeypatch.setattr(ValueOperator, "log", lambda *args, **kwargs: None)
-    monkeypatch.setattr(ValueOperator, "log_dict", lambda *args, **kwargs: None)
     weights = {"value": 1.0, "costate": 0.7, "boundary": 0.3, "residual": 0.5}
-    operator = make_operator(game, activation=activation, weights=weights, exact_terminal=exact).double()
+    module = make_module(game, weights=weights, activation=activation, exact_terminal=exact).double()
+    operator = module.operator
     points = [random_points(operator.game, size, seed, types=3) for seed, size in enumerate((9, 7, 5))]
     generator = torch.Generator().manual_seed(1)
     value = -40 * torch.rand(9, 2, generator=generator, dtype=torch.float64)
@@ -394,9 +394,9 @@ def test_training_step_has_the_gradients_of_a_plain_reference(
     batch = {
         "bvp": Sample(points[0], Labels(value, costate)), "interior": Sample(points[1]), "terminal": Sample(end),
     }  # fmt: skip
-    losses = operator.training_step(batch, 0), plain_loss(operator, batch, weights)
+    losses = module.training_step(batch, 0), plain_loss(operator, batch, weights)
     torch.testing.assert_close(losses[0], losses[1], rtol=1e-12, atol=0)
-    parameters = dict(operator.net.named_parameters())
+    parameters = dict(operator.named_parameters())
     ours, theirs = (torch.autograd.grad(loss, list(parameters.values()), allow_unused=True) for loss in losses)
     for name, mine, other in zip(parameters, ours, theirs, strict=True):
         other = torch.zeros_like(parameters[name]) if other is None else other

@@ -7,6 +7,7 @@ from typing import Any
 
 from hno.evaluation.closed_loop import TypeRow
 from hno.evaluation.metrics import clopper_pearson
+from hno.evaluation.outcome import Outcome
 
 
 def type_row(
@@ -14,11 +15,11 @@ def type_row(
 ) -> dict[str, Any]:
     """One row of results.json's table."""
     some = safe > 0
-    row = TypeRow(
-        theta, seen, safe + 1, 0, 1, 0, 0, safe, collisions, collisions / safe if some else None,
-        clopper_pearson(collisions, safe), 2.0 if some else None, excess if some else None, cost if some else None,
+    found = Outcome(
+        safe + 1, 0, 1, 0, 0, safe, collisions, collisions / safe if some else None, clopper_pearson(collisions, safe),
+        2.0 if some else None, None, excess if some else None, None, None, cost if some else None, None,
     )  # fmt: skip
-    return row._asdict()
+    return TypeRow(theta, seen, False, False, found, None, None).content()
 
 
 def episode(theta: tuple[float, float], clearance: float, dimensions: int = 2, frames: int = 4) -> dict[str, Any]:

@@ -1,3 +1,3 @@
-from tests.operators.conftest import make_operator
+from tests.operators.conftest import make_module, make_operator
 
-__all__ = ["make_operator"]
+__all__ = ["make_module", "make_operator"]

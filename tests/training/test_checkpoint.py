@@ -3,6 +3,7 @@ from __future__ import annotations
 import os
 import pickle
 from collections.abc import Callable
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,29 +12,36 @@ import torch
 from torch import Tensor
 
 import hno
+from hno.control import Feedback
 from hno.games import make
 from hno.games.base import ExtrapolationWarning
-from hno.operators import operators
+from hno.operators import ValueOperator
 from hno.registry import UnknownNameError
-from hno.training.checkpoint import CheckpointError, OperatorPolicy, check_resumable, load_operator, read_checkpoint
-from hno.types import Field, Points
-from tests.operators.conftest import GAMES, MakeOperator, random_points
+from hno.training.checkpoint import CheckpointError, Provenance, check_resumable, load_operator, read_checkpoint, record
+from hno.types import Field, Points, Types
+from tests.operators.conftest import GAMES, MakeOperator, architecture, random_points
 
 Save = Callable[..., Path]
 
 
+ORIGIN = Provenance("hno", [(1.0, 1.0), (1.0, 5.0)], 7, "hash")
+
+
+def saved(operator: ValueOperator, **options: Any) -> dict[str, Any]:
+    """What training writes of an operator of these options."""
+    weights = {f"operator.{name}": weight for name, weight in operator.state_dict().items()}
+    return record(operator.game, architecture(**options), ORIGIN) | {"state_dict": weights}
+
+
 @pytest.fixture
 def save(make_operator: MakeOperator, tmp_path: Path) -> Save:
-    """Write the checkpoint of a random operator, with some entries of its spec or content replaced."""
+    """Write the checkpoint of a random operator, with some entries of its record or content replaced."""
 
     def write(game: str = "narrow_road", spec: dict[str, Any] | None = None, **content: Any) -> Path:
-        operator = make_operator(game)
-        operator.seen_types = [(1.0, 1.0), (1.0, 5.0)]
-        saved: dict[str, Any] = {"state_dict": operator.state_dict()}
-        operator.on_save_checkpoint(saved)
-        saved["hno"] |= spec or {}
+        whole = saved(make_operator(game))
+        whole["hno"] |= spec or {}
         path = tmp_path / "last.ckpt"
-        torch.save(saved | content, path)
+        torch.save(whole | content, path)
         return path
 
     return write
@@ -48,21 +56,21 @@ def refused(path: Path, **options: str) -> str:
 
 @pytest.mark.parametrize("game", GAMES)
 def test_round_trip(make_operator: MakeOperator, save: Save, game: str) -> None:
-    loaded, original = load_operator(save(game), game), make_operator(game)
+    path, original = save(game), make_operator(game)
+    loaded, parts, origin = load_operator(path, game)
     points = random_points(original.game)
     assert all(map(torch.equal, loaded.field(points), original.field(points)))
-    assert loaded.seen_types == [(1.0, 1.0), (1.0, 5.0)]
-    assert loaded.names() == {"game": game, "operator": "hno", "activation": "tanh"}
+    assert (parts, origin) == (architecture(), ORIGIN)
     assert not loaded.training
     assert not any(weights.requires_grad for weights in loaded.parameters())
+    policy = hno.load_policy(path)
+    assert policy.types == [(1.0, 1.0), (1.0, 5.0)]
+    assert policy.names() == {"game": game, "operator": "hno", "activation": "tanh"}
 
 
-def test_changed_constants_travel_with_the_checkpoint(tmp_path: Path) -> None:
-    operator = operators.get("sno")(make("narrow_road", radius=1.4), width=8, depth=1)
-    saved: dict[str, Any] = {"state_dict": operator.state_dict()}
-    operator.on_save_checkpoint(saved)
-    torch.save(saved, tmp_path / "last.ckpt")
-    assert load_operator(tmp_path / "last.ckpt").game.radius == 1.4
+def test_changed_constants_travel_with_the_checkpoint(make_operator: MakeOperator, tmp_path: Path) -> None:
+    torch.save(saved(make_operator(make("narrow_road", radius=1.4))), tmp_path / "last.ckpt")
+    assert load_operator(tmp_path / "last.ckpt")[0].game.radius == 1.4
 
 
 def test_missing_file(tmp_path: Path) -> None:
@@ -105,7 +113,7 @@ def test_a_folder_is_no_checkpoint(tmp_path: Path) -> None:
 def test_checkpoint_of_another_program(tmp_path: Path, content: object) -> None:
     path = tmp_path / "other.ckpt"
     torch.save(content, path)
-    assert "not written by this version of hno" in refused(path)
+    assert "was not written by hno" in refused(path)
 
 
 class Trap:
@@ -145,10 +153,16 @@ def test_checkpoint_of_another_game(save: Save) -> None:
     assert "'narrow_road'" in message
 
 
-@pytest.mark.parametrize("entry", ["game", "operator"])
-def test_checkpoint_of_something_that_is_not_registered_here(save: Save, entry: str) -> None:
-    with pytest.raises(UnknownNameError, match="Known: "):
-        load_operator(save(spec={entry: "elsewhere"}))
+@pytest.mark.parametrize("part", ["operator", "network", "activation"])
+def test_a_part_that_is_not_registered_here(save: Save, part: str) -> None:
+    parts = asdict(architecture()) | {part: {"name": "elsewhere", "options": {}}}
+    with pytest.raises(UnknownNameError, match=rf"No {part} named 'elsewhere'\. Known: "):
+        load_operator(save(spec={"architecture": parts}))
+
+
+def test_a_game_that_is_not_registered_here(save: Save) -> None:
+    with pytest.raises(UnknownNameError, match=r"No game named 'elsewhere'\. Known: "):
+        load_operator(save(spec={"game": "elsewhere"}))
 
 
 def test_changed_physics(save: Save, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -158,27 +172,42 @@ def test_changed_physics(save: Save, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_weights_of_another_network(save: Save) -> None:
-    assert "does not hold the weights" in refused(
-        save(spec={"options": {"activation": "tanh", "width": 32, "depth": 2}})
-    )
+    assert "does not hold the weights" in refused(save(spec={"architecture": asdict(architecture(width=32))}))
     assert "does not hold the weights" in refused(save(state_dict={}))
 
 
-def test_another_format_or_an_incomplete_spec(save: Save) -> None:
-    assert "not written by this version" in refused(save(spec={"format": 99}))
-    assert "not complete" in refused(save(hno={"format": 1, "game": "narrow_road"}))
+@pytest.mark.parametrize("version", [1, 2, 99, None])
+def test_another_format_is_one_clear_sentence(save: Save, version: int | None) -> None:
+    """Format 2 is what the releases before wrote: an operator's own name, options and types."""
+    older = {"format": version, "game": "narrow_road", "operator": "hno", "options": {"width": 64}, "seen_types": []}
+    path = save(hno=older)
+    assert refused(path) == f"{path} has format {version}, this version of hno reads format 3: train it again."
+    assert "train it again" in refused(save(spec={"format": version}))
 
 
-def test_resuming_asks_for_the_same_game_operator_and_network(make_operator: MakeOperator, save: Save) -> None:
-    path = save()
-    check_resumable(path, make_operator())
-    for other in (
-        make_operator("drone"),
-        make_operator(name="sno"),
-        make_operator(width=32),
-        make_operator(activation="sin"),
+@pytest.mark.parametrize("entry", ["game", "constants", "fingerprint", "architecture", "provenance"])
+def test_an_incomplete_record_is_refused(make_operator: MakeOperator, tmp_path: Path, entry: str) -> None:
+    whole = saved(make_operator())
+    del whole["hno"][entry]
+    path = tmp_path / "last.ckpt"
+    torch.save(whole, path)
+    assert refused(path) == f"{path} is not complete: its entry 'hno' lacks {entry}. Train it again."
+
+
+def test_resuming_asks_for_the_same_game_operator_network_and_origin(make_operator: MakeOperator, save: Save) -> None:
+    path, game = save(), make("narrow_road")
+    check_resumable(path, record(game, architecture(), ORIGIN))
+    for other, differs in (
+        (record(make("drone"), architecture(), ORIGIN), "game 'narrow_road', expected 'drone'"),
+        (record(make("narrow_road", radius=1.4), architecture(), ORIGIN), "radius"),
+        (record(game, architecture(width=32), ORIGIN), "width 16, expected 32"),
+        (record(game, architecture(members=3), ORIGIN), "members 1, expected 3"),
+        (record(game, architecture("sin"), ORIGIN), "'tanh', expected 'sin'"),
+        (record(game, architecture(), replace(ORIGIN, method="sno")), "method 'hno', expected 'sno'"),
+        (record(game, architecture(), replace(ORIGIN, seed=8)), "seed 7, expected 8"),
+        (record(game, architecture(), replace(ORIGIN, config_hash="another")), "config_hash"),
     ):
-        with pytest.raises(CheckpointError, match="Resume with its own configuration"):
+        with pytest.raises(CheckpointError, match=f"{differs}.*Resume with its own configuration"):
             check_resumable(path, other)
 
 
@@ -216,10 +245,10 @@ def test_policy_plays_the_controls_of_the_paper(save: Save, game: str, size: flo
 
 def test_policy_reads_own_costates_only(make_operator: MakeOperator, monkeypatch: pytest.MonkeyPatch) -> None:
     operator = make_operator()
-    policy, points = OperatorPolicy(operator), random_points(operator.game)
+    policy, points = Feedback(operator), random_points(operator.game)
     before, field = policy(*points), operator.field
 
-    def with_other_cross_costates(at: Points) -> Field:
+    def with_other_cross_costates(at: Points, types: Types | None = None) -> Field:
         known = field(at)
         costate = known.costate.clone()
         costate[:, 0, 1] += 100
@@ -271,10 +300,3 @@ def test_fingerprint_tells_sensors_apart() -> None:
     changed = make("narrow_road")
     changed.first_sensor = 0.5
     assert changed.fingerprint() != make("narrow_road").fingerprint()
-
-
-def test_resuming_asks_for_the_same_configuration(make_operator: MakeOperator, save: Save) -> None:
-    path, other = save(), make_operator()
-    other.config_hash = "another"
-    with pytest.raises(CheckpointError, match="config_hash"):
-        check_resumable(path, other)

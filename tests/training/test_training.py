@@ -8,41 +8,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from hno.games import make
-from hno.losses import Scales, hji_residual
+from hno.losses import Norm, View, hji_residual
 from hno.losses.hji import Boundary
-from hno.operators import ValueOperator, operators
 from hno.operators.inputs import distinct_types
 from hno.registry import UnknownNameError
-from hno.training.optimizers import OPTIMIZERS, SCHEDULES, make_optimizer, muon
+from hno.training.module import TrainingModule
+from hno.training.optimizers import FACTORIES, SCHEDULES, make_optimizer, muon
 from hno.types import Batch, Labels, Points, Sample
-from tests.operators.conftest import ACTIVATIONS, MakeOperator, random_points
-
-STREAMS = ("bvp", "interior", "terminal")
-
-
-@pytest.fixture(autouse=True)
-def quiet(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Operators train without a Lightning trainer here, so there is nobody to log to."""
-    monkeypatch.setattr(ValueOperator, "log", lambda *args, **kwargs: None)
-    monkeypatch.setattr(ValueOperator, "log_dict", lambda *args, **kwargs: None)
-
-
-def in_contact(x: Tensor) -> Tensor:
-    """Joint states of the narrow road in which the cars are side by side, so that the penalty feels the radius."""
-    x = x.clone()
-    x[:, 1, 0] = 70 - x[:, 0, 0]
-    return x
-
-
-def random_batch(operator: ValueOperator, size: int = 8) -> Batch:
-    game = operator.game
-    points = {name: random_points(game, size, seed) for seed, name in enumerate(STREAMS)}
-    points["terminal"] = points["terminal"]._replace(tau=torch.zeros_like(points["terminal"].tau))
-    points["interior"] = points["interior"]._replace(x=in_contact(points["interior"].x))
-    value, costate = torch.randn(size, 2), torch.randn(size, 2, 2, game.state_dim)
-    labels = Labels(40 * value.to(points["bvp"].x), 3 * costate.to(points["bvp"].x))
-    return {name: Sample(at, labels if name == "bvp" else None) for name, at in points.items()}
+from tests.operators.conftest import ACTIVATIONS, MakeModule, MakeOperator, random_batch, random_points
 
 
 def rows(batch: Batch, index: torch.Tensor) -> Batch:
@@ -56,39 +29,39 @@ def rows(batch: Batch, index: torch.Tensor) -> Batch:
 
 
 @pytest.mark.parametrize("activation", ACTIVATIONS)
-def test_slopes_of_trunk_and_branch_move_apart(make_operator: MakeOperator, activation: str) -> None:
+def test_slopes_of_trunk_and_branch_move_apart(make_module: MakeModule, activation: str) -> None:
     """Published defect 2: both slopes shared one storage."""
-    operator = make_operator(activation=activation)
-    batch = random_batch(operator)
-    optimizer = torch.optim.SGD(operator.net.parameters(), lr=1e-4)  # Adam's first steps are of one size
-    slopes = operator.net.trunk.activation.slope, operator.net.branch.activation.slope
+    module = make_module(activation=activation)
+    batch = random_batch(module.operator.game)
+    optimizer = torch.optim.SGD(module.operator.parameters(), lr=1e-4)  # Adam's first steps are of one size
+    slopes = module.operator.networks[0].trunk.activation.slope, module.operator.networks[0].branch.activation.slope
     for step in range(5):
         optimizer.zero_grad()
-        operator.training_step(batch, step).backward()
+        module.training_step(batch, step).backward()
         optimizer.step()
     assert min(abs(slope.item() - 0.1) for slope in slopes) > 1e-5
     assert abs(slopes[0].item() - slopes[1].item()) > 1e-6
 
 
 @pytest.mark.parametrize("scaled", [True, False])
-def test_loss_is_a_mean_over_rows(make_operator: MakeOperator, scaled: bool) -> None:
+def test_loss_is_a_mean_over_rows(make_module: MakeModule, scaled: bool) -> None:
     """Published defect 6: sums over rows, so that a weight means something else at another batch size."""
-    operator = make_operator(scaled=scaled).double()
-    batch = random_batch(operator, 6)
-    whole = operator.training_step(batch, 0)
-    singles = [operator.training_step(rows(batch, torch.tensor([row])), 0) for row in range(6)]
+    module = make_module(scaled=scaled).double()
+    batch = random_batch(module.operator.game, 6)
+    whole = module.training_step(batch, 0)
+    singles = [module.training_step(rows(batch, torch.tensor([row])), 0) for row in range(6)]
     torch.testing.assert_close(whole, torch.stack(singles).mean())
-    twice = operator.training_step(rows(batch, torch.arange(6).repeat(2)), 0)
+    twice = module.training_step(rows(batch, torch.arange(6).repeat(2)), 0)
     torch.testing.assert_close(twice, whole)
 
 
-def test_residual_takes_the_theta_of_its_own_row(make_operator: MakeOperator) -> None:
+def test_residual_takes_the_theta_of_its_own_row(make_module: MakeModule) -> None:
     """Published defect 1, in the loss: rolling the types of the collocation rows must change it."""
-    operator = make_operator(weights={"residual": 1.0}).double()
-    batch = {"interior": random_batch(operator)["interior"]}
+    module = make_module(weights={"residual": 1.0}).double()
+    batch = {"interior": random_batch(module.operator.game)["interior"]}
     at = batch["interior"].points
     rolled = {"interior": Sample(at._replace(theta=at.theta.roll(1, 0)))}
-    assert operator.training_step(batch, 0).item() != pytest.approx(operator.training_step(rolled, 0).item(), rel=1e-6)
+    assert module.training_step(batch, 0).item() != pytest.approx(module.training_step(rolled, 0).item(), rel=1e-6)
 
 
 ALL = {"value": 1.0, "costate": 1.0, "boundary": 0.1, "residual": 0.1}
@@ -98,7 +71,6 @@ ALL = {"value": 1.0, "costate": 1.0, "boundary": 0.1, "residual": 0.1}
     ("name", "weights", "streams"),
     [
         ("hno", ALL, {"bvp", "interior", "terminal"}),
-        ("sno", ALL, {"bvp"}),
         ("hno", None, {"bvp", "interior", "terminal"}),
         ("sno", None, {"bvp"}),
         ("hno", ALL | {"boundary": 0.0}, {"bvp", "interior"}),
@@ -109,58 +81,55 @@ ALL = {"value": 1.0, "costate": 1.0, "boundary": 0.1, "residual": 0.1}
     ],
 )
 def test_streams_are_those_of_the_weighted_terms(
-    make_operator: MakeOperator, name: str, weights: Mapping[str, float] | None, streams: set[str]
+    make_module: MakeModule, name: str, weights: Mapping[str, float] | None, streams: set[str]
 ) -> None:
-    assert make_operator(name=name, weights=weights).streams == streams
+    assert make_module(method=name, weights=weights).streams == streams
 
 
-def test_a_boundary_that_holds_exactly_needs_no_points(make_operator: MakeOperator) -> None:
+def test_a_boundary_that_holds_exactly_needs_no_points(make_module: MakeModule) -> None:
     """The term is 0 there."""
-    operator, free = (make_operator(weights=ALL, exact_terminal=exact) for exact in (True, False))
-    assert operator.streams == free.streams - {"terminal"}
-    operator.load_state_dict(free.state_dict())
-    batch = random_batch(operator)
-    missing = Boundary().residual(operator.game, batch["terminal"], operator.field(batch["terminal"].points))
-    assert missing.abs().max() == 0
-    assert operator.loss_terms(batch).keys() == free.loss_terms(batch).keys() - {"boundary"}
-
-
-def test_weights_of_foreign_terms_are_ignored(make_operator: MakeOperator) -> None:
-    assert make_operator(name="sno", weights=ALL).weights == {"value": 1.0, "costate": 1.0}
+    module, free = (make_module(weights=ALL, exact_terminal=exact) for exact in (True, False))
+    assert module.streams == free.streams - {"terminal"}
+    module.load_state_dict(free.state_dict())
+    operator, batch = module.operator, random_batch(module.operator.game)
+    field = operator.field(batch["terminal"].points)
+    view = View(operator.game, batch["terminal"], field, lambda at: operator.field(at, None), operator.scales, 0)
+    assert Boundary().residual(view).abs().max() == 0
+    assert module.losses(batch).keys() == free.losses(batch).keys() - {"boundary"}
 
 
 @pytest.mark.parametrize(
     "weights",
     [dict.fromkeys(ALL, 0.0), ALL | {"value": -1.0}, ALL | {"costate": float("nan")}, ALL | {"residual": float("inf")}],
 )
-def test_impossible_weights_are_refused(make_operator: MakeOperator, weights: Mapping[str, float]) -> None:
+def test_impossible_weights_are_refused(make_module: MakeModule, weights: Mapping[str, float]) -> None:
     with pytest.raises(ValueError, match="Loss weights must be finite, not negative and not all 0"):
-        make_operator(weights=weights)
+        make_module(weights=weights)
 
 
-def test_a_term_of_weight_zero_changes_nothing(make_operator: MakeOperator) -> None:
-    supervised = make_operator(name="sno")
-    operator = make_operator(weights=ALL | {"residual": 0.0, "boundary": 0.0})
-    batch = random_batch(operator)
-    torch.testing.assert_close(operator.training_step(batch, 0), supervised.training_step(batch, 0))
+def test_a_term_of_weight_zero_changes_nothing(make_module: MakeModule) -> None:
+    supervised = make_module(method="sno")
+    module = make_module(weights=ALL | {"residual": 0.0, "boundary": 0.0})
+    batch = random_batch(module.operator.game)
+    torch.testing.assert_close(module.training_step(batch, 0), supervised.training_step(batch, 0))
 
 
-def test_terms_without_their_stream_wait(make_operator: MakeOperator) -> None:
-    operator, supervised = make_operator(weights=ALL), make_operator(name="sno")
-    batch = {"bvp": random_batch(operator)["bvp"]}
-    torch.testing.assert_close(operator.training_step(batch, 0), supervised.training_step(batch, 0))
+def test_terms_without_their_stream_wait(make_module: MakeModule) -> None:
+    module, supervised = make_module(weights=ALL), make_module(method="sno")
+    batch = {"bvp": random_batch(module.operator.game)["bvp"]}
+    torch.testing.assert_close(module.training_step(batch, 0), supervised.training_step(batch, 0))
 
 
-def test_loss_adds_the_weighted_terms(make_operator: MakeOperator) -> None:
-    batch = random_batch(make_operator())
-    single = {name: make_operator(weights={name: 1.0}).training_step(batch, 0).detach() for name in ALL}
-    total = make_operator(weights=ALL).training_step(batch, 0).detach()
+def test_loss_adds_the_weighted_terms(make_module: MakeModule) -> None:
+    batch = random_batch(make_module().operator.game)
+    single = {name: make_module(weights={name: 1.0}).training_step(batch, 0).detach() for name in ALL}
+    total = make_module(weights=ALL).training_step(batch, 0).detach()
     torch.testing.assert_close(total, sum(ALL[name] * loss for name, loss in single.items()))
 
 
-def test_training_needs_an_optimizer(make_operator: MakeOperator) -> None:
+def test_training_needs_an_optimizer(make_module: MakeModule) -> None:
     with pytest.raises(ValueError, match="without an optimizer"):
-        make_operator().configure_optimizers()
+        make_module().configure_optimizers()
 
 
 @pytest.mark.parametrize(
@@ -219,9 +188,9 @@ def test_a_rate_that_has_fallen_stays(schedule: str) -> None:
 
 
 @pytest.mark.parametrize("schedule", SCHEDULES)
-@pytest.mark.parametrize("name", sorted(OPTIMIZERS))
+@pytest.mark.parametrize("name", sorted(FACTORIES))
 def test_a_schedule_scales_the_rate_of_every_group(make_operator: MakeOperator, name: str, schedule: str) -> None:
-    parameters = list(make_operator().net.parameters())
+    parameters = list(make_operator().parameters())
     built = make_optimizer(name, 10, lr=1e-2, schedule=schedule, final_lr=1e-3)(parameters)
     optimizer, first = built["optimizer"], [group["lr"] for group in built["optimizer"].param_groups]
     assert sum(len(group["params"]) for group in optimizer.param_groups) == len(parameters)
@@ -234,25 +203,25 @@ def test_a_schedule_scales_the_rate_of_every_group(make_operator: MakeOperator, 
         assert [group["lr"] for group in optimizer.param_groups] == pytest.approx([share * lr for lr in first])
 
 
-def test_the_rate_that_a_schedule_scales_is_the_one_that_is_applied(make_operator: MakeOperator) -> None:
+def test_the_rate_that_a_schedule_scales_is_the_one_that_is_applied(make_module: MakeModule) -> None:
     """Muon has rates of two kinds; at rate 0 nothing may move, whatever its kind."""
-    operator = make_operator()
-    built = make_optimizer("muon", 1, lr=2e-2, schedule="linear", final_lr=0.0)(operator.net.parameters())
-    batch = random_batch(operator)
+    module = make_module()
+    built = make_optimizer("muon", 1, lr=2e-2, schedule="linear", final_lr=0.0)(module.operator.parameters())
+    batch = random_batch(module.operator.game)
     moved = []
     for step in range(2):
-        before = [weights.detach().clone() for weights in operator.net.parameters()]
+        before = [weights.detach().clone() for weights in module.operator.parameters()]
         built["optimizer"].zero_grad()
-        operator.training_step(batch, step).backward()
+        module.training_step(batch, step).backward()
         built["optimizer"].step()
         built["lr_scheduler"]["scheduler"].step()
-        moved.append([not torch.equal(w, old) for w, old in zip(operator.net.parameters(), before, strict=True)])
+        moved.append([not torch.equal(w, old) for w, old in zip(module.operator.parameters(), before, strict=True)])
     assert all(moved[0])
     assert not any(moved[1])
 
 
 def test_muon_is_for_matrices_and_adamw_for_everything_else(make_operator: MakeOperator) -> None:
-    net = make_operator().net
+    net = make_operator().networks[0]
     optimizer = muon(net.parameters(), lr=2e-2, adamw_lr=5e-3)
     groups = {group["use_muon"]: group for group in optimizer.param_groups}
     assert {id(weights) for weights in groups[True]["params"]} == {id(w) for w in net.parameters() if w.dim() == 2}
@@ -283,15 +252,15 @@ def test_muon_decays_matrices_alone() -> None:
     assert torch.equal(vector.detach(), torch.ones(4))
 
 
-@pytest.mark.parametrize("name", sorted(OPTIMIZERS))
-def test_every_optimizer_lowers_a_loss(make_operator: MakeOperator, name: str) -> None:
-    operator = make_operator(name="sno")
-    batch = random_batch(operator, 32)
-    built = make_optimizer(name, 30, lr=3e-3, schedule="constant", final_lr=0.0)(operator.net.parameters())
+@pytest.mark.parametrize("name", sorted(FACTORIES))
+def test_every_optimizer_lowers_a_loss(make_module: MakeModule, name: str) -> None:
+    module = make_module(method="sno")
+    batch = random_batch(module.operator.game, 32)
+    built = make_optimizer(name, 30, lr=3e-3, schedule="constant", final_lr=0.0)(module.operator.parameters())
     losses = []
     for step in range(30):
         built["optimizer"].zero_grad()
-        loss = operator.training_step(batch, step)
+        loss = module.training_step(batch, step)
         loss.backward()
         built["optimizer"].step()
         losses.append(loss.item())
@@ -300,10 +269,10 @@ def test_every_optimizer_lowers_a_loss(make_operator: MakeOperator, name: str) -
 
 def test_norms_are_refused_by_name() -> None:
     with pytest.raises(ValueError, match="huber, l1, l2"):
-        operators.get("hno")(make("drone"), norm="l3")
+        Norm("l3")
 
 
-@pytest.mark.parametrize("name", sorted(OPTIMIZERS))
+@pytest.mark.parametrize("name", sorted(FACTORIES))
 def test_unknown_optimizer_options_are_refused_before_training(name: str) -> None:
     with pytest.raises(KeyError, match="No option of"):
         make_optimizer(name, steps=3, lr=1e-3, schedule="constant", final_lr=0.0, foo=1)
@@ -321,157 +290,156 @@ def test_options_of_muon_come_with_the_nearest(option: str, near: str) -> None:
 def logged(monkeypatch: pytest.MonkeyPatch) -> dict[str, float]:
     """What the latest training step logged."""
     content: dict[str, float] = {}
-    monkeypatch.setattr(ValueOperator, "log", lambda self, name, value, **kwargs: content.update({name: float(value)}))
+    monkeypatch.setattr(TrainingModule, "log", lambda self, name, value, **kwargs: content.update({name: float(value)}))
     monkeypatch.setattr(
-        ValueOperator,
+        TrainingModule,
         "log_dict",
         lambda self, values, **kwargs: content.update({n: float(v) for n, v in values.items()}),
     )
     return content
 
 
-def test_balanced_terms_begin_at_their_weights(make_operator: MakeOperator) -> None:
+def test_balanced_terms_begin_at_their_weights(make_module: MakeModule) -> None:
     """The first running mean of a term is the term itself."""
-    batch = random_batch(make_operator())
-    operator = make_operator(weights=ALL, balance=True)
-    assert operator.training_step(batch, 0).item() == pytest.approx(sum(ALL.values()))
-    assert make_operator(name="sno", balance=True).training_step(batch, 0).item() == pytest.approx(2)
-    late = make_operator(weights=ALL, balance=True)
+    batch = random_batch(make_module().operator.game)
+    module = make_module(weights=ALL, balance=True)
+    assert module.training_step(batch, 0).item() == pytest.approx(sum(ALL.values()))
+    assert make_module(method="sno", balance=True).training_step(batch, 0).item() == pytest.approx(2)
+    late = make_module(weights=ALL, balance=True)
     assert late.training_step({"bvp": batch["bvp"]}, 0).item() == pytest.approx(2)
     first = late.training_step(batch, 1).item()
     assert first == pytest.approx(2 + 0.1 + 0.1), "terms that join later begin at their weights too"
 
 
-def test_a_balanced_term_is_divided_by_its_running_mean(make_operator: MakeOperator, logged: dict[str, float]) -> None:
-    operator = make_operator(weights=ALL, balance=True)
-    batches = [random_batch(operator, 8) for _ in range(4)]
+def test_a_balanced_term_is_divided_by_its_running_mean(make_module: MakeModule, logged: dict[str, float]) -> None:
+    module = make_module(weights=ALL, balance=True)
+    batches = [random_batch(module.operator.game, 8) for _ in range(4)]
     mean: dict[str, float] = {}
     for step, batch in enumerate(batches):
-        total = operator.training_step(batch, step).item()
+        total = module.training_step(batch, step).item()
         now = {name: logged[f"loss/{name}"] for name in ALL}
         mean = {name: 0.99 * mean.get(name, now[name]) + 0.01 * now[name] for name in ALL}
         assert total == pytest.approx(sum(ALL[name] * now[name] / mean[name] for name in ALL), rel=1e-5)
         assert logged["loss/total"] == pytest.approx(total)
 
 
-def test_a_balanced_loss_has_the_gradient_of_the_log_loss(make_operator: MakeOperator) -> None:
-    operator, plain = make_operator(weights=ALL, balance=True), make_operator(weights=ALL)
-    batch = random_batch(operator)
-    slopes = torch.autograd.grad(operator.training_step(batch, 0), list(operator.net.parameters()))
-    logs = [ALL[name] * loss.log() for name, loss in plain.loss_terms(batch).items()]
-    expected = torch.autograd.grad(torch.stack(logs).sum(), list(plain.net.parameters()))
+def test_a_balanced_loss_has_the_gradient_of_the_log_loss(make_module: MakeModule) -> None:
+    module, plain = make_module(weights=ALL, balance=True), make_module(weights=ALL)
+    batch = random_batch(module.operator.game)
+    slopes = torch.autograd.grad(module.training_step(batch, 0), list(module.operator.parameters()))
+    logs = [ALL[name] * loss.log() for name, loss in plain.losses(batch).items()]
+    expected = torch.autograd.grad(torch.stack(logs).sum(), list(plain.operator.parameters()))
     for found, slope in zip(slopes, expected, strict=True):
         torch.testing.assert_close(found, slope, rtol=1e-3, atol=1e-6)
 
 
-def test_a_balanced_loss_does_not_depend_on_the_unit_of_a_term(make_operator: MakeOperator) -> None:
+def test_a_balanced_loss_does_not_depend_on_the_unit_of_a_term(make_module: MakeModule) -> None:
     totals = []
     for scaled in (True, False):
-        operator = make_operator(name="sno", balance=True, scaled=scaled)
-        operator.set_scales(Scales(torch.tensor(40.0), torch.full_like(operator.costate_scale, 3.0)))
+        module = make_module(method="sno", balance=True, scaled=scaled)
         torch.manual_seed(0)
-        totals.append([operator.training_step(random_batch(operator), step).item() for step in range(3)])
+        totals.append([module.training_step(random_batch(module.operator.game), step).item() for step in range(3)])
     assert totals[0] == pytest.approx(totals[1], rel=1e-4)
 
 
 def test_a_balanced_term_that_vanishes_leaves_the_loss_finite(
-    make_operator: MakeOperator, monkeypatch: pytest.MonkeyPatch
+    make_module: MakeModule, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(Boundary, "residual", lambda self, game, sample, field: 0 * field.value)
-    operator = make_operator(weights=ALL, balance=True)
-    batch = random_batch(operator)
+    monkeypatch.setattr(Boundary, "residual", lambda self, view: 0 * view.field.value)
+    module = make_module(weights=ALL, balance=True)
+    batch = random_batch(module.operator.game)
     for step in range(2):
-        loss = operator.training_step(batch, step)
+        loss = module.training_step(batch, step)
         loss.backward()
         assert loss.item() == pytest.approx(2.1, rel=0.2)
-    assert all(bool(w.grad.isfinite().all()) for w in operator.net.parameters() if w.grad is not None)
+    assert all(bool(w.grad.isfinite().all()) for w in module.operator.parameters() if w.grad is not None)
 
 
-def test_running_means_survive_a_checkpoint(make_operator: MakeOperator) -> None:
-    whole = make_operator(weights=ALL, balance=True)
-    batches = [random_batch(whole) for _ in range(3)]
+def test_running_means_survive_a_checkpoint(make_module: MakeModule) -> None:
+    whole = make_module(weights=ALL, balance=True)
+    batches = [random_batch(whole.operator.game) for _ in range(3)]
     for step in range(2):
         whole.training_step(batches[step], step)
-    resumed = make_operator(weights=ALL, balance=True, seed=1)
+    resumed = make_module(weights=ALL, balance=True, seed=1)
     resumed.load_state_dict(whole.state_dict())
-    assert bool((resumed.running > 0).all())
-    fresh = make_operator(weights=ALL, balance=True)
-    fresh.net.load_state_dict(whole.net.state_dict())
-    totals = [operator.training_step(batches[2], 2).item() for operator in (whole, resumed, fresh)]
+    assert bool((resumed.objective.running > 0).all())
+    fresh = make_module(weights=ALL, balance=True)
+    fresh.operator.load_state_dict(whole.operator.state_dict())
+    totals = [module.training_step(batches[2], 2).item() for module in (whole, resumed, fresh)]
     assert totals[0] == totals[1]
     assert totals[0] != totals[2]
 
 
-def test_means_run_only_where_they_are_asked_for(make_operator: MakeOperator) -> None:
-    operator = make_operator(weights=ALL)
-    operator.training_step(random_batch(operator), 0)
-    assert not operator.running.any()
+def test_means_run_only_where_they_are_asked_for(make_module: MakeModule) -> None:
+    module = make_module(weights=ALL)
+    module.training_step(random_batch(module.operator.game), 0)
+    assert not module.objective.running.any()
 
 
-def residuals(operator: ValueOperator, batch: Batch) -> Tensor:
+def residuals(module: TrainingModule, batch: Batch) -> Tensor:
     """Residual of every player at every collocation point, in the unit of the loss, (B, P)."""
-    points, game = batch["interior"].points, operator.game
+    points, operator, game = batch["interior"].points, module.operator, module.operator.game
     size = operator.value_scale / game.horizon + game.penalty(points.x, points.theta)
     with torch.no_grad():
         found = hji_residual(game, points, operator.field(points))
-    return found / size if operator.scaled else found
+    return found / size if module.objective.scaled else found
 
 
 @pytest.mark.parametrize("scaled", [True, False])
 @pytest.mark.parametrize(("share", "count"), [(0.25, 3), (0.5, 6), (0.05, 1), (0.01, 1), (0.999, 12)])
 @pytest.mark.parametrize("table", [True, False])
 def test_only_the_hardest_points_count(
-    make_operator: MakeOperator, scaled: bool, share: float, count: int, table: bool
+    make_module: MakeModule, scaled: bool, share: float, count: int, table: bool
 ) -> None:
     options = {"weights": {"value": 1.0, "residual": 0.5}, "scaled": scaled}
-    operator = make_operator(hardest=share, **options).double()
-    batch = random_batch(operator, 12)
-    batch["interior"] = Sample(random_points(operator.game, 12, seed=11))
+    module = make_module(hardest=share, **options).double()
+    batch = random_batch(module.operator.game, 12)
+    batch["interior"] = Sample(random_points(module.operator.game, 12, seed=11))
     if table:
         batch = {name: s._replace(types=distinct_types(s.points.theta)) for name, s in batch.items()}
-    signed = residuals(operator, batch)
+    signed = residuals(module, batch)
     sizes = signed.abs().amax(-1)
     assert bool((signed.amax(-1) < sizes)[sizes.topk(2).indices].any()), "large negative ones count as well"
     hardest = sizes.argsort(descending=True)[:count]
-    expected = make_operator(**options).double().loss_terms(batch | {"interior": batch["interior"].rows(hardest)})
-    found = operator.loss_terms(batch)
+    expected = make_module(**options).double().losses(batch | {"interior": batch["interior"].rows(hardest)})
+    found = module.losses(batch)
     torch.testing.assert_close(found["residual"], expected["residual"], rtol=1e-12, atol=0)
     torch.testing.assert_close(found["value"], expected["value"], rtol=1e-12, atol=0)
     assert len(sizes.unique()) == 12
     easier = sizes.argsort(descending=True)[1 : count + 1]
-    other = make_operator(**options).double().loss_terms(batch | {"interior": batch["interior"].rows(easier)})
+    other = make_module(**options).double().losses(batch | {"interior": batch["interior"].rows(easier)})
     assert (found["residual"] - other["residual"]).abs() > 1e-9 or count == 12
 
 
-def test_all_points_count_where_none_is_left_out(make_operator: MakeOperator, monkeypatch: pytest.MonkeyPatch) -> None:
-    batch = random_batch(make_operator())
-    every = make_operator(weights=ALL).training_step(batch, 0)
-    operator = make_operator(weights=ALL, hardest=1.0)
+def test_all_points_count_where_none_is_left_out(make_module: MakeModule, monkeypatch: pytest.MonkeyPatch) -> None:
+    batch = random_batch(make_module().operator.game)
+    every = make_module(weights=ALL).training_step(batch, 0)
+    module = make_module(weights=ALL, hardest=1.0)
 
     def never(*arguments: object) -> None:
         raise AssertionError("rows were picked")
 
     monkeypatch.setattr(Sample, "rows", never)
-    assert torch.equal(operator.training_step(batch, 0), every)
+    assert torch.equal(module.training_step(batch, 0), every)
 
 
-def test_the_hardest_points_have_a_gradient(make_operator: MakeOperator) -> None:
-    operator = make_operator(weights={"residual": 1.0}, hardest=0.25)
-    operator.training_step(random_batch(operator), 0).backward()
-    assert bool(operator.net.trunk.layers[0].weight.grad.any())
+def test_the_hardest_points_have_a_gradient(make_module: MakeModule) -> None:
+    module = make_module(weights={"residual": 1.0}, hardest=0.25)
+    module.training_step(random_batch(module.operator.game), 0).backward()
+    assert bool(module.operator.networks[0].trunk.layers[0].weight.grad.any())
 
 
-def test_only_collocation_points_are_left_out(make_operator: MakeOperator) -> None:
-    batch = random_batch(make_operator())
-    terms = {share: make_operator(weights=ALL, hardest=share).loss_terms(batch) for share in (1.0, 0.2)}
+def test_only_collocation_points_are_left_out(make_module: MakeModule) -> None:
+    batch = random_batch(make_module().operator.game)
+    terms = {share: make_module(weights=ALL, hardest=share).losses(batch) for share in (1.0, 0.2)}
     for name in ("value", "costate", "boundary"):
         assert torch.equal(terms[1.0][name], terms[0.2][name])
     assert not torch.equal(terms[1.0]["residual"], terms[0.2]["residual"])
-    sno = {share: make_operator(name="sno", hardest=share).training_step(batch, 0) for share in (1.0, 0.2)}
+    sno = {share: make_module(method="sno", hardest=share).training_step(batch, 0) for share in (1.0, 0.2)}
     assert torch.equal(*sno.values())
 
 
 @pytest.mark.parametrize("share", [0, 0.0, -0.5, 1.0001, 2, math.nan, math.inf])
-def test_impossible_shares_of_points_are_refused(make_operator: MakeOperator, share: float) -> None:
+def test_impossible_shares_of_points_are_refused(make_module: MakeModule, share: float) -> None:
     with pytest.raises(ValueError, match=r"loss.hardest is a share in \(0, 1\]"):
-        make_operator(hardest=share)
+        make_module(hardest=share)

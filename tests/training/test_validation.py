@@ -11,17 +11,17 @@ import pytest
 import torch
 from torch import Tensor
 
+from hno.control import Feedback
 from hno.control.rollout import rollout
-from hno.data import GameData
-from hno.data.curriculum import Curriculum
+from hno.data import Collocation, GameData, LabelPlan, make_sampler
 from hno.evaluation.closed_loop import collision_table
 from hno.games import Game, make
-from hno.operators import ValueOperator, operators
-from hno.training import validation as module
-from hno.training.checkpoint import OperatorPolicy
+from hno.training import validation
+from hno.training.module import TrainingModule
 from hno.training.validation import BEST, ClosedLoopValidation, Score, score, starts_of
 from hno.types import Extremal, Field, Points, Trajectory, join
 from tests.fakes import fake_labels
+from tests.operators.conftest import MakeModule
 from tests.walkers import Walkers
 
 GAMES = ("narrow_road", "lane_change", "drone")
@@ -59,12 +59,11 @@ Play = Callable[[Tensor], Tensor]
 
 
 @pytest.fixture
-def walking(monkeypatch: pytest.MonkeyPatch) -> Callable[[Play], ValueOperator]:
-    """An operator of the walkers' game whose policy is known: the costate of a velocity u is 2 u."""
-    monkeypatch.setattr(ValueOperator, "log_dict", lambda self, values, **kwargs: None)
+def walking(monkeypatch: pytest.MonkeyPatch, make_module: MakeModule) -> Callable[[Play], TrainingModule]:
+    """Training of an operator of the walkers' game whose policy is known: the costate of a velocity u is 2 u."""
 
-    def build(play: Play) -> ValueOperator:
-        operator = operators.get("hno")(Walkers(), width=8, depth=1)
+    def build(play: Play) -> TrainingModule:
+        module = make_module(Walkers(), width=8, depth=1)
 
         def field(points: Points, types: object = None) -> Field:
             costate = torch.zeros(len(points.x), 2, 2, 2)
@@ -72,8 +71,8 @@ def walking(monkeypatch: pytest.MonkeyPatch) -> Callable[[Play], ValueOperator]:
                 costate[:, i, i] = 2 * play(points.x)[:, i]
             return Field(points.theta, points.theta, costate)
 
-        monkeypatch.setattr(operator, "field", field)
-        return operator
+        monkeypatch.setattr(module.operator, "field", field)
+        return module
 
     return build
 
@@ -107,7 +106,7 @@ def make_validation(tmp_path: Path) -> Callable[..., ClosedLoopValidation]:
 
 
 Build = Callable[..., ClosedLoopValidation]
-Walking = Callable[[Play], ValueOperator]
+Walking = Callable[[Play], TrainingModule]
 
 
 @pytest.mark.parametrize(("safe", "close"), [(4, 0), (3, 1), (1, 3), (0, 4)])
@@ -172,15 +171,16 @@ def test_a_policy_that_is_not_a_number_collides(make_validation: Build, walking:
 
 @pytest.mark.parametrize("name", GAMES)
 @pytest.mark.parametrize("value", [torch.nan, torch.inf, 1e30])
-def test_weights_that_diverged_collide_without_an_error(make_validation: Build, name: str, value: float) -> None:
-    game = make(name)
-    operator = operators.get("hno")(game, width=8, depth=1)
+def test_weights_that_diverged_collide_without_an_error(
+    make_validation: Build, make_module: MakeModule, name: str, value: float
+) -> None:
+    game, module = make(name), make_module(name, width=8, depth=1)
     with torch.no_grad():
-        for weights in operator.net.parameters():
+        for weights in module.operator.parameters():
             weights.fill_(value)
     callback = make_validation(dt=0.1)
     callback.begin([fake_labels(game, (1.0, 5.0), 3)])
-    found = callback.consider(Trainer(), operator)
+    found = callback.consider(Trainer(), module)
     assert found is not None
     assert 0 <= found.collision_rate <= 1
     if not math.isfinite(value):
@@ -189,20 +189,20 @@ def test_weights_that_diverged_collide_without_an_error(make_validation: Build, 
 
 @pytest.mark.parametrize("name", GAMES)
 @pytest.mark.parametrize("exact", [False, True])
-def test_episodes_are_those_of_the_evaluation(make_validation: Build, name: str, exact: bool) -> None:
+def test_episodes_are_those_of_the_evaluation(
+    make_validation: Build, make_module: MakeModule, name: str, exact: bool
+) -> None:
     """The same policy, starts and collisions as in the table of an evaluated checkpoint."""
-    torch.manual_seed(0)
-    game = make(name)
-    operator = operators.get("hno")(game, width=8, depth=1, exact_terminal=exact)
+    game, module = make(name), make_module(name, width=8, depth=1, exact_terminal=exact)
     start = game.initial_box.sample(12, torch.Generator().manual_seed(0))
     labels = [fake_labels(game, (1.0, 5.0), 12, start=start), fake_labels(game, (2.0, 2.0), 12, seed=1, start=start)]
     callback = make_validation(dt=0.1, probe=12)
     callback.begin(labels)
-    found = callback.consider(Trainer(), operator)
-    rows = collision_table(game, OperatorPolicy(operator.eval().requires_grad_(False)), labels, [], dt=0.1)
+    found = callback.consider(Trainer(), module)
+    rows = collision_table(game, Feedback(module.operator.eval().requires_grad_(False)), labels, [], dt=0.1)
     assert found is not None
-    assert found.collision_rate == pytest.approx(sum(row.collisions for row in rows) / 24)
-    single = [row.median_excess_cost for row in rows]
+    assert found.collision_rate == pytest.approx(sum(row.outcome.collisions for row in rows) / 24)
+    single = [row.outcome.median_excess_cost for row in rows]
     assert min(single) <= found.excess * float(starts_of(labels).cost.median()) <= max(single)
 
 
@@ -210,13 +210,13 @@ def test_episodes_are_those_of_the_evaluation(make_validation: Build, name: str,
 def episodes(monkeypatch: pytest.MonkeyPatch) -> list[Tensor]:
     """Start states of every simulation that a validation asks for."""
     seen: list[Tensor] = []
-    original = module.rollout
+    original = validation.rollout
 
     def watched(game: Game, policy: object, x0: Tensor, *arguments: object) -> Trajectory:
         seen.append(x0)
         return original(game, policy, x0, *arguments)
 
-    monkeypatch.setattr(module, "rollout", watched)
+    monkeypatch.setattr(validation, "rollout", watched)
     return seen
 
 
@@ -271,14 +271,14 @@ def test_it_plays_every_so_often_and_at_the_end(
         return Score(1.0, 0.0)
 
     monkeypatch.setattr(ClosedLoopValidation, "play", play)
-    callback, operator, trainer = make_validation(every=4), walking(straight), Trainer(max_steps=10)
+    callback, module, trainer = make_validation(every=4), walking(straight), Trainer(max_steps=10)
     callback.begin([labelled([SAFE])])
     for trainer.global_step in range(1, 11):
-        callback.on_train_batch_end(trainer, operator, None, None, trainer.global_step - 1)
+        callback.on_train_batch_end(trainer, module, None, None, trainer.global_step - 1)
     assert steps == [4, 8, 10]
     even = Trainer(max_steps=8)
     for even.global_step in range(1, 9):
-        callback.on_train_batch_end(even, operator, None, None, even.global_step - 1)
+        callback.on_train_batch_end(even, module, None, None, even.global_step - 1)
     assert steps == [4, 8, 10, 4, 8]
 
 
@@ -293,23 +293,23 @@ def test_best_checkpoint_is_that_of_the_best_score(
     ]  # fmt: skip
     kept = [1, 2, 3, 3, 3, 6, 7, 8, 8, 10, 10, 10, 13]
     monkeypatch.setattr(ClosedLoopValidation, "play", lambda self, trainer, *_: scores[trainer.global_step - 1])
-    callback, operator, trainer = make_validation(every=1), walking(straight), Trainer()
+    callback, module, trainer = make_validation(every=1), walking(straight), Trainer()
     callback.begin([labelled([SAFE])])
     for number, step in enumerate(kept):
         trainer.global_step = number + 1
-        callback.on_train_batch_end(trainer, operator, None, None, number)
+        callback.on_train_batch_end(trainer, module, None, None, number)
         assert (tmp_path / BEST).read_text() == str(step)
         assert callback.best == scores[step - 1]
 
 
-def kept_scores(callback: ClosedLoopValidation, operator: ValueOperator, found: Sequence[Score]) -> list[Score | None]:
+def kept_scores(callback: ClosedLoopValidation, module: TrainingModule, found: Sequence[Score]) -> list[Score | None]:
     """The best score after each of these."""
     callback.begin([labelled([SAFE])])
     scores, kept = iter(found), list[Score | None]()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ClosedLoopValidation, "play", lambda self, *_: next(scores))
         for _ in found:
-            callback.consider(Trainer(), operator)
+            callback.consider(Trainer(), module)
             kept.append(callback.best)
     return kept
 
@@ -373,20 +373,18 @@ def test_training_ends_once_it_is_safe_if_asked(make_validation: Build, walking:
 
 def test_what_was_found_is_logged(make_validation: Build, walking: Walking, monkeypatch: pytest.MonkeyPatch) -> None:
     told: list[dict[str, float]] = []
-    operator, trainer, callback = walking(straight), Trainer(), make_validation(every=1)
-    monkeypatch.setattr(ValueOperator, "log_dict", lambda self, values, **kwargs: told.append(values))
+    module, trainer, callback = walking(straight), Trainer(), make_validation(every=1)
+    monkeypatch.setattr(TrainingModule, "log_dict", lambda self, values, **kwargs: told.append(values))
     callback.begin([labelled([SAFE, CLOSE], excess=0.5)])
-    callback.on_train_batch_end(trainer, operator, None, None, 0)
+    callback.on_train_batch_end(trainer, module, None, None, 0)
     assert told == [{"closed_loop/collision_rate": 0.5, "closed_loop/excess": pytest.approx(0.5, abs=1e-3)}]
     assert 0 < callback.seconds < 60
 
 
 def test_data_are_told_where_the_first_starts_led(make_validation: Build, walking: Walking, tmp_path: Path) -> None:
-    arguments = {"types": [(1.0, 1.0)], "trajectories": 2, "cache": tmp_path, "seed": 0}
-    sizes = {"bvp": 4, "interior": 4, "terminal": 4}
-    data = GameData(
-        Walkers(), {"interior"}, batch_sizes=sizes, curriculum=Curriculum(0, 0), shares={"rollout": 1.0}, **arguments
-    )
+    sampler, sizes = make_sampler({"rollout": 1.0}), {"bvp": 4, "interior": 4, "terminal": 4}
+    labels = LabelPlan(types=[(1.0, 1.0)], trajectories=2, cache=tmp_path)
+    data = GameData(Walkers(), {"interior"}, 0, labels, Collocation(sampler), sizes)
     callback = make_validation(probe=2, dt=0.1)
     callback.begin([labelled([SAFE, 0.7, 0.5])])
     callback.consider(Trainer(datamodule=data), walking(straight))
@@ -445,15 +443,16 @@ def test_starts_keep_the_order_of_their_labels() -> None:
     torch.testing.assert_close(starts.cost, -whole.value[:, 0].sum(-1).float())
 
 
-def test_an_operator_in_double_precision_is_validated(make_validation: Build) -> None:
-    game = make("narrow_road")
-    operator = operators.get("hno")(game, width=8, depth=1).double()
+def test_an_operator_in_double_precision_is_validated(make_validation: Build, make_module: MakeModule) -> None:
+    game, module = make("narrow_road"), make_module(width=8, depth=1).double()
     callback = make_validation(dt=0.1)
     callback.begin([fake_labels(game, (1.0, 5.0), 3)])
-    assert callback.consider(Trainer(), operator) is not None
+    assert callback.consider(Trainer(), module) is not None
 
 
-def test_starts_go_to_the_device_of_the_operator(make_validation: Build, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_starts_go_to_the_device_of_the_operator(
+    make_validation: Build, make_module: MakeModule, monkeypatch: pytest.MonkeyPatch
+) -> None:
     devices: list[str] = []
 
     class SeenError(Exception):
@@ -463,10 +462,10 @@ def test_starts_go_to_the_device_of_the_operator(make_validation: Build, monkeyp
         devices.extend((x0.device.type, theta.device.type))
         raise SeenError
 
-    monkeypatch.setattr(module, "rollout", look)
-    operator = operators.get("hno")(make("narrow_road"), width=8, depth=1).to("meta")
+    monkeypatch.setattr(validation, "rollout", look)
+    module = make_module(width=8, depth=1).to("meta")
     callback = make_validation()
     callback.begin([fake_labels(make("narrow_road"), (1.0, 5.0), 3)])
     with pytest.raises(SeenError):
-        callback.consider(Trainer(), operator)
+        callback.consider(Trainer(), module)
     assert devices == ["meta", "meta"]

@@ -7,11 +7,7 @@ from typing import Any
 import pytest
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from hno.operators import ValueOperator
-from hno.operators.inputs import distinct_types
-from hno.types import Batch
-from tests.operators.conftest import GAMES, MakeOperator
-from tests.training.test_training import random_batch
+from tests.operators.conftest import GAMES, MakeModule, MakeOperator, random_batch, with_tables
 
 WAITING = ("_local_scalar_dense", "nonzero", "_unique2", "unique_dim", "masked_select", "equal", "is_nonzero")
 """Operators of ATen that read from a device."""
@@ -26,25 +22,18 @@ class NeverWait(TorchDispatchMode):
         return func(*args, **(kwargs or {}))
 
 
-def with_tables(batch: Batch) -> Batch:
-    """As the datamodule makes batches."""
-    return {name: sample._replace(types=distinct_types(sample.points.theta)) for name, sample in batch.items()}
-
-
 @pytest.mark.parametrize("game", GAMES)
-@pytest.mark.parametrize("options", [{}, {"exact_terminal": True, "balance": True, "hardest": 0.5}])
+@pytest.mark.parametrize("options", [{}, {"exact_terminal": True, "balance": True, "hardest": 0.5, "members": 3}])
 def test_a_training_step_does_not_wait_for_the_device(
-    make_operator: MakeOperator, monkeypatch: pytest.MonkeyPatch, game: str, options: dict[str, Any]
+    make_module: MakeModule, game: str, options: dict[str, Any]
 ) -> None:
-    monkeypatch.setattr(ValueOperator, "log", lambda *args, **kwargs: None)
-    monkeypatch.setattr(ValueOperator, "log_dict", lambda *args, **kwargs: None)
-    operator = make_operator(game, **options)
-    batch = with_tables(random_batch(operator))
+    module = make_module(game, **options)
+    batch = with_tables(random_batch(module.operator.game))
     with NeverWait():
-        operator.training_step(batch, 0).backward()
+        module.training_step(batch, 0).backward()
 
 
 def test_searching_for_types_does(make_operator: MakeOperator) -> None:
     operator = make_operator()
     with pytest.raises(AssertionError, match="waits for the device"), NeverWait():
-        operator.field(random_batch(operator)["bvp"].points)
+        operator.field(random_batch(operator.game)["bvp"].points)

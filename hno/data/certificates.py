@@ -1,4 +1,4 @@
-"""What the certificates of a label set say, in numbers."""
+"""What certificates say about the labels of a set: which starts are safe, and how good the labels are."""
 
 from __future__ import annotations
 
@@ -13,12 +13,17 @@ LOCAL_GAP = 1e-4
 GLOBAL_GAP = 1e-3
 """Best-response gap from several manoeuvres above which an equilibrium is a local one, relative."""
 CLEARANCE = 0.02
-"""What a safe start's equilibrium keeps by default, m for distance constraints."""
+"""What a safe start's equilibrium keeps by default, in the unit of the game's constraint."""
 
 
 def safe(found: Extremal, clearance: float = CLEARANCE) -> Tensor:
     """Starts whose equilibrium keeps a clearance, (B,)."""
     return (found.status == Status.CONVERGED) & (found.clearance >= clearance)
+
+
+def marginal(found: Extremal, clearance: float = CLEARANCE) -> Tensor:
+    """Starts whose equilibrium does not collide, but keeps less than a clearance, (B,)."""
+    return (found.status == Status.CONVERGED) & (found.clearance > 0) & (found.clearance < clearance)
 
 
 def inevitable(found: Extremal) -> Tensor:

@@ -5,7 +5,7 @@ import json
 import pytest
 import torch
 
-from hno.data.trust import CLEARANCE, GLOBAL_GAP, LOCAL_GAP, inevitable, safe, summary
+from hno.data.certificates import CLEARANCE, GLOBAL_GAP, LOCAL_GAP, inevitable, safe, summary
 from hno.games import make
 from hno.types import Extremal, Status
 from tests.fakes import fake_labels

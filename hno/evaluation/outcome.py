@@ -1,0 +1,168 @@
+"""What came of some episodes: how safe they were and what they cost, compared with the labels of their starts."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from hno.data.certificates import inevitable, marginal, safe
+from hno.evaluation.metrics import clopper_pearson, quantiles, saturated_share
+from hno.games import Game
+from hno.types import Extremal, Status, Trajectory, join
+
+SHARES = (0.05, 0.25, 0.5)
+"""Quantiles of the smallest distance that are reported."""
+
+
+class Outcome(NamedTuple):
+    """What came of some episodes; numbers that do not exist or are not finite are None.
+
+    A start counts if its equilibrium is safe: it keeps a stated clearance. All numbers but the first five are over
+    these starts.
+    """
+
+    starts: int
+    """Start states asked for."""
+    unsolved: int
+    """Starts without a converged label."""
+    inevitable: int
+    """Starts whose equilibrium collides."""
+    marginal: int
+    """Starts whose equilibrium does not collide but keeps less than the stated clearance."""
+    marginal_collisions: int
+    """Collisions among those."""
+    safe_starts: int
+    """Starts that count."""
+    collisions: int
+    """Collisions, between steps too."""
+    rate: float | None
+    """Collisions per safe start."""
+    interval: tuple[float, float] | None
+    """Clopper-Pearson 95 % interval of the rate."""
+    median_min_distance: float | None
+    """Median of the smallest distance between players, m."""
+    distance_quantiles: tuple[float, ...] | None
+    """5 %, 25 % and 50 % quantiles of the smallest distance between players, m."""
+    median_excess_cost: float | None
+    """Median of the joint cost above the label's."""
+    largest_excess_cost: float | None
+    """Largest of the joint cost above the label's."""
+    median_excess_costs: tuple[float, ...] | None
+    """Median of each player's own cost above the label's."""
+    median_label_cost: float | None
+    """Median of the label's joint cost."""
+    saturated: float | None
+    """Share of controls on a bound of their box, over steps, players and controls."""
+
+
+def outcome(game: Game, labels: Extremal, played: Trajectory, clearance: float) -> Outcome:
+    """What came of episodes that were played from the starts of labels.
+
+    Args:
+        game: the game.
+        labels: B rows.
+        played: the episodes from the same starts, B rows.
+        clearance: what the label must keep for its start to count, in the unit of the game's constraint.
+    """
+    counted, near = safe(labels, clearance), marginal(labels, clearance)
+    count, collisions = int(counted.sum()), int((played.collided & counted).sum())
+    excess = excess_costs(labels, played)[counted]
+    distances = finite(quantiles(played.distance[counted], SHARES))
+    return Outcome(
+        starts=len(labels.status),
+        unsolved=int((labels.status != Status.CONVERGED).sum()),
+        inevitable=int(inevitable(labels).sum()),
+        marginal=int(near.sum()),
+        marginal_collisions=int((played.collided & near).sum()),
+        safe_starts=count,
+        collisions=collisions,
+        rate=collisions / count if count else None,
+        interval=clopper_pearson(collisions, count),
+        median_min_distance=None if distances is None else distances[-1],
+        distance_quantiles=distances,
+        median_excess_cost=median(excess.sum(-1)),
+        largest_excess_cost=_single(excess.sum(-1).max()) if count else None,
+        median_excess_costs=finite(excess.median(0).values) if count else None,
+        median_label_cost=median(joint_cost(labels)[counted]),
+        saturated=saturated_share(played.u[counted], game.control_box),
+    )
+
+
+def excess_costs(labels: Extremal, played: Trajectory) -> Tensor:
+    """Each player's cost above the label's, (B, P)."""
+    return labels.value[:, 0] - played.value.double()
+
+
+def joint_cost(labels: Extremal) -> Tensor:
+    """Sum of all players' costs in the equilibrium, (B,)."""
+    return -labels.value[:, 0].sum(-1)
+
+
+def together(labels: Sequence[Extremal], played: Sequence[Trajectory]) -> tuple[Extremal, Trajectory]:
+    """Labels and episodes of several types as one set."""
+    columns = zip(*(episodes[1:] for episodes in played), strict=True)
+    return join(labels), Trajectory(played[0].t, *(torch.cat(column) for column in columns))
+
+
+def median(values: Tensor) -> float | None:
+    """The lower median; None without numbers, or where it is not finite."""
+    return _single(values.median()) if len(values) else None
+
+
+def _single(value: Tensor) -> float | None:
+    return float(value) if bool(value.isfinite()) else None
+
+
+def finite(values: Tensor) -> tuple[float, ...] | None:
+    """Numbers as they are stored, (N,); None if one is not finite."""
+    return tuple(values.tolist()) if bool(values.isfinite().all()) else None
+
+
+class Pooled(NamedTuple):
+    """The outcomes of several types in one line; numbers that do not exist are None."""
+
+    collisions: int
+    """Over all types."""
+    safe_starts: int
+    """Starts that count, over all types."""
+    rate: float | None
+    """Collisions per safe start."""
+    interval: tuple[float, float] | None
+    """Clopper-Pearson 95 % interval of the rate."""
+    worst_theta: tuple[float, ...] | None
+    """The types with the highest rate, the first ones where several share it; None where nothing collides."""
+    worst_rate: float | None
+    """The highest rate of any types."""
+    relative_excess: float | None
+    """Median over types of (median joint cost above the equilibrium's) / (median of the equilibrium's)."""
+
+
+def pooled(rows: Sequence[Mapping[str, Any]]) -> Pooled:
+    """Outcomes by type in one line.
+
+    Args:
+        rows: "theta" and the entries of an `Outcome` for each type, such as the rows of results.json's `table`.
+    """
+    collisions, count = (sum(row[name] for row in rows) for name in ("collisions", "safe_starts"))
+    played = [row for row in rows if row["safe_starts"]]
+    worst = max(played, key=lambda row: row["collisions"] / row["safe_starts"], default=None)
+    return Pooled(
+        collisions=collisions,
+        safe_starts=count,
+        rate=collisions / count if count else None,
+        interval=clopper_pearson(collisions, count),
+        worst_theta=tuple(worst["theta"]) if worst is not None and collisions else None,
+        worst_rate=None if worst is None else worst["collisions"] / worst["safe_starts"],
+        relative_excess=_relative_excess(played),
+    )
+
+
+def _relative_excess(rows: Sequence[Mapping[str, Any]]) -> float | None:
+    """None where no type has both costs."""
+    costs = [(row.get("median_excess_cost"), row.get("median_label_cost")) for row in rows]
+    ratios = [above / abs(cost) for above, cost in costs if above is not None and cost]
+    return statistics.median(ratios) if ratios else None

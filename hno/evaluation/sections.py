@@ -1,0 +1,117 @@
+"""Sections of an evaluation: what is computed for each, and the columns that terminal and page show of it.
+
+A section is one registered class, which a package from outside may add by the entry-point group `hno.sections`. Its
+name is its entry in results.json and the configuration entry that asks for it.
+"""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, ClassVar, NamedTuple
+
+from hno.control.rollout import Player
+from hno.evaluation.conditions import Condition
+from hno.evaluation.format import NOT_AVAILABLE
+from hno.games import Game
+from hno.operators import ValueOperator
+from hno.registry import Registry
+from hno.types import Extremal, Trajectory
+
+sections: Registry[Section] = Registry("section", "hno.evaluation")
+
+
+def plain(value: Any) -> str:
+    """Any value as text; "n/a" for None."""
+    return NOT_AVAILABLE if value is None else str(value)
+
+
+class Column(NamedTuple):
+    """A column of a section's table."""
+
+    name: str
+    """Entry of a row that it shows."""
+    heading: str
+    """Above the column."""
+    unit: str = ""
+    """Of its numbers; empty where they have none, or their text names it."""
+    format: Callable[[Any], str] = plain
+    """The text of an entry."""
+
+    @property
+    def title(self) -> str:
+        """Heading and unit."""
+        return f"{self.heading}, {self.unit}" if self.unit else self.heading
+
+
+class Evaluation(NamedTuple):
+    """One model and the conditions under which it is evaluated."""
+
+    name: str
+    """Path of its checkpoint."""
+    operator: ValueOperator
+    """Its value function."""
+    policy: Player
+    """Its feedback controls of all players."""
+    seen: Sequence[tuple[float, ...]]
+    """Types that it was trained with."""
+    types: Sequence[tuple[float, ...]]
+    """Types that are evaluated."""
+    condition: Condition
+    """Of the starts and the episodes."""
+    clearance: float
+    """What a label must keep for its start to count, in the unit of the game's constraint."""
+    dt: float
+    """Time for which a control is held, s."""
+    options: Mapping[str, Any]
+    """Entries of the configuration, for those of a section's own."""
+    solve: Callable[[Condition], Sequence[Extremal]]
+    """Labels of the starts of a condition, one set per type."""
+    labels: Sequence[Extremal] = ()
+    """Labels of the starts, one set per type; empty before they are solved."""
+    played: Sequence[Trajectory] = ()
+    """Episodes from these starts, one set per type."""
+
+    @property
+    def game(self) -> Game:
+        """The game."""
+        return self.operator.game
+
+
+class Section(abc.ABC):
+    """A part of results.json that is shown as a table with remarks below it."""
+
+    heading: ClassVar[str]
+    """Above the table."""
+    note: ClassVar[str] = ""
+    """What the columns mean, where their headings do not say it."""
+    columns: ClassVar[tuple[Column, ...]]
+    """From left to right."""
+
+    @abc.abstractmethod
+    def rows(self, content: Any) -> Sequence[Mapping[str, Any]]:
+        """Lines of the table, each with an entry for every column, from the section's content of results.json."""
+
+    def remarks(self, content: Any, results: Mapping[str, Any]) -> list[str]:
+        """Sentences below the table.
+
+        Args:
+            content: see `rows`.
+            results: the other entries of results.json, such as `clearance` and `constraint_unit`.
+        """
+        return []
+
+
+class ModelSection(Section):
+    """A section that is computed for every model."""
+
+    def check(self, evaluation: Evaluation) -> None:
+        """Refuse what cannot be computed, before any label is solved.
+
+        Raises:
+            ValueError: entries of the configuration, or the model, make no such section.
+        """
+
+    @abc.abstractmethod
+    def compute(self, evaluation: Evaluation) -> Any:
+        """The section's content of results.json."""
