@@ -10,20 +10,25 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from hno import games
+    from hno.cli.calls import evaluate, train
     from hno.control.rollout import rollout
     from hno.games.testing import check_game
     from hno.pontryagin.solve import solve
     from hno.training.checkpoint import load_policy
+    from hno.training.fit import fit
 
 __version__ = "0.1.0"
-__all__ = ["__version__", "check_game", "games", "load_policy", "rollout", "solve"]
+__all__ = ["__version__", "check_game", "evaluate", "fit", "games", "load_policy", "rollout", "solve", "train"]
 
 _PLACES = {
     "check_game": "hno.games.testing:check_game",
+    "evaluate": "hno.cli.calls:evaluate",
+    "fit": "hno.training.fit:fit",
     "games": "hno.games",
     "load_policy": "hno.training.checkpoint:load_policy",
     "rollout": "hno.control.rollout:rollout",
     "solve": "hno.pontryagin.solve:solve",
+    "train": "hno.cli.calls:train",
 }
 
 

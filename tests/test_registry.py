@@ -39,8 +39,12 @@ class Axolotl:
 """
 GROUPS = {
     "game": "hno.games",
+    "operator": "hno.operators",
+    "network": "hno.networks",
     "activation": "hno.activations",
     "loss": "hno.losses",
+    "source": "hno.sources",
+    "optimizer": "hno.optimizers",
 }
 """The entry-point group of every kind."""
 NAMES = ("zoo_for_tests", "zoo_for_tests.savanna", "pond_for_tests")
@@ -262,7 +266,10 @@ def test_classes_know_their_names(animals):
     [
         ("hno.games", "games", {"drone", "lane_change", "narrow_road"}),
         ("hno.losses", "losses", {"boundary", "costate", "residual", "value"}),
-        ("hno.operators", "operators", {"hno", "sno"}),
+        ("hno.operators", "operators", {"gradient"}),
+        ("hno.operators", "networks", {"deeponet"}),
+        ("hno.data.sources", "sources", {"band", "box", "labels", "rollout"}),
+        ("hno.training.optimizers", "optimizers", {"adam", "adamw", "muon", "soap"}),
     ],
 )
 def test_the_package_registers_what_it_ships(module, name, known):

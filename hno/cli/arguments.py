@@ -20,7 +20,7 @@ HYDRA_VALUE_FLAGS = {
 }  # fmt: skip
 KNOWN = FLAGS | VALUE_FLAGS | HYDRA_FLAGS | HYDRA_VALUE_FLAGS
 """Every flag and its long form."""
-TYPES = re.compile(r"(\+*(?:theta|unseen|(?:\w+\.)*types)=)([-+\d.,;\s]*[,;][-+\d.,;\s]*)")
+TYPES = re.compile(r"""(\+*(?:theta|unseen|(?:\w+\.)*types)=)([-+.\d][^'"\[\]{}$]*[,;][^'"\[\]{}$]*)""")
 """Player types as a list of numbers, which Hydra's grammar takes in quotes only."""
 
 

@@ -21,9 +21,9 @@ def run(given: Arguments) -> int:
     from hno.games.testing import ContractError, check_game
 
     use_threads(1)
-    name = given.words[0]
+    name, constants = given.words[0], _constants(given.overrides)
     try:
-        game = _game(name, _constants(given.overrides))
+        game = _game(name, constants)
         check_game(game)
     except (ContractError, LookupError, ValueError, ImportError, TypeError) as error:
         print(f"{name} cannot be used yet: {error}", file=sys.stderr)

@@ -188,10 +188,14 @@ def read(model: type[S], config: DictConfig) -> S:
     files = [folder / "experiment" / f"{chosen}.yaml" for folder in Folders.all()]
     helpers = {key for file in files if file.exists() for key in OmegaConf.load(file)} - model.model_fields.keys()
     given = {override.partition("=")[0].lstrip("+~") for override in hydra_config.overrides.task}
+    known = {key: value for key, value in _content(config).items() if key not in helpers and value != "???"}
+    return validated(model, known, given)
+
+
+def _content(config: DictConfig) -> dict[str, Any]:
     content = OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
     assert isinstance(content, dict)
-    known = {str(key): value for key, value in content.items() if key not in helpers and value != "???"}
-    return validated(model, known, given)
+    return {str(key): value for key, value in content.items()}
 
 
 def configured(name: str, model: type[S], given: Arguments) -> S | None:
@@ -206,8 +210,8 @@ def configured(name: str, model: type[S], given: Arguments) -> S | None:
     try:
         config = compose(name, overrides)
         chosen = [override for override in overrides if override.split("=")[0] in groups(name)]
-        for key, value in compose(name, chosen).items() if chosen else ():
-            if key not in model.model_fields and config[key] == value:
+        for key, value in _content(compose(name, chosen)).items():
+            if key not in model.model_fields and _content(config)[key] == value:
                 del config[key]
         settings = read(model, config)
     except (HydraException, OmegaConfBaseException) as error:

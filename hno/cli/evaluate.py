@@ -90,7 +90,7 @@ def evaluate(settings: EvaluateSettings) -> bool:
     head = {"checkpoint": paths[0], "config_hash": config_hash(settings), "config": plain(settings)}
     results = Results(folder / "results.json", head)
     try:
-        _run(settings, paths, results)
+        evaluate_models(settings, paths, results)
     except Exception as error:
         results.update(status="failed", reason=f"{type(error).__name__}: {error}")
         report(error)
@@ -108,7 +108,8 @@ def checkpoints_of(settings: EvaluateSettings) -> list[Path]:
     return [trained(str(path)) for path in (given if isinstance(given, list) else [given])]
 
 
-def _run(settings: EvaluateSettings, paths: Sequence[str], results: Results) -> None:
+def evaluate_models(settings: EvaluateSettings, paths: Sequence[str], results: Results) -> None:
+    """Evaluate the models of these files; every part is written into the results as it is done."""
     use_threads(settings.threads)
     policies, types = load(settings)
     results.update(**policies[0].names(), seed=policies[0].provenance.seed)
