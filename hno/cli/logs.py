@@ -70,7 +70,7 @@ def _tensorboard(config: DictConfig, folder: Path) -> Logger:
     try:
         return TensorBoardLogger(folder, name="", version="tensorboard", default_hp_metric=False)
     except ModuleNotFoundError as error:
-        message = "TensorBoard is not installed: pip install 'hno[tensorboard]', or choose logger=csv."
+        message = "TensorBoard is not installed: pip install tensorboard, or choose logger=csv."
         raise LoggerMissingError(message) from error
 
 
