@@ -150,7 +150,7 @@ def test_it_trains(make_module: MakeModule, network: str) -> None:
 def test_the_fast_way_is_that_of_autograd(activation: str) -> None:
     """Value, gradient and their derivatives in every parameter of the DeepONet, to rounding."""
     torch.manual_seed(0)
-    network = DeepONet(Inputs(5, 4, 1, 7), activations.get(activation), width=8, depth=3).double()
+    network = DeepONet(Inputs(5, 4, 1, 0, 7), activations.get(activation), width=8, depth=3).double()
     with torch.no_grad():
         for parameter in network.parameters():
             parameter.mul_(1.1).add_(0.013)

@@ -45,8 +45,8 @@ class Crowd(ControlAffineGame):
     def constraint(self, x: Tensor, theta: Tensor) -> Tensor:
         apart = (x.unsqueeze(-2) - x.unsqueeze(-3)).square().sum(-1).add(1e-9).sqrt()
         radii = 0.1 * (theta.unsqueeze(-1) + theta.unsqueeze(-2))
-        alone = torch.eye(3, dtype=torch.bool, device=x.device)
-        return (radii - apart).masked_fill(alone, -torch.inf).amax(-1)
+        others = ~torch.eye(3, dtype=torch.bool, device=x.device)
+        return (radii - apart)[..., others].unflatten(-1, (3, 2))
 
     def sensors(self, theta: Tensor) -> Tensor:
         others = theta.sum(-1, keepdim=True) - theta
