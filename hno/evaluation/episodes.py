@@ -56,7 +56,9 @@ def _episode(game: Game, played: Trajectory, label: Extremal, row: int) -> dict[
     frames = sorted({*range(0, len(played.t), math.ceil(len(played.t) / FRAMES)), closest})
     t, x = played.t[frames], played.x[row, frames]
     places = game.positions(x)
-    radius = game.constraint(x, theta.expand(len(t), -1)).amax((-2, -1)) + separation(places).amin(-1)
+    radius = torch.zeros_like(t)  # of constraints that are no distances, or of one player
+    if game.distance_constraints and game.players > 1:
+        radius = game.constraint(x, theta.expand(len(t), -1)).amax((-2, -1)) + separation(places).amin(-1)
     return {
         "theta": [float(entry) for entry in theta],
         "collided": not float(played.clearance[row]) > 0,
