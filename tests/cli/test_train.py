@@ -14,7 +14,7 @@ from torch import Tensor
 
 import hno
 from hno.cli import evaluate
-from hno.cli.evaluate import draw
+from hno.cli.media import draw_typical
 from hno.cli.results import Results
 from hno.cli.train import label_statistics
 from hno.evaluation import outcome
@@ -131,7 +131,7 @@ def test_last_checkpoint_is_that_of_the_last_step(command: Command, steps: int, 
 
 
 def test_run_leaves_a_picture_of_an_episode(command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(evaluate, "draw", draw)
+    monkeypatch.setattr(evaluate, "draw_typical", draw_typical)
     run = command("train", *SMOKE, "trainer.max_steps=1")
     assert (run.folder / "rollout.png").read_bytes().startswith(b"\x89PNG")
 
