@@ -77,7 +77,8 @@ def draw(results: Mapping[str, Any], folder: Path, kinds: Collection[type[Logger
         worst = worst_episode(results, folder) if WandbLogger in kinds else None
         if worst is not None:
             made["worst_episode"] = folder / "worst_episode.png"
-            heading = f"{title}\nsmallest clearance, {number(worst['clearance'])} m at ({name_of(worst['theta'])})"
+            smallest = f"{number(worst['clearance'])} {results.get('constraint_unit', 'm')}".strip()
+            heading = f"{title}\nsmallest clearance, {smallest} at ({name_of(worst['theta'])})"
             pictures.rollout_picture(episode(worst), made["worst_episode"], heading)
         if not {WandbLogger, TensorBoardLogger}.isdisjoint(kinds):
             made["collision_map"] = folder / "collision_map.png"

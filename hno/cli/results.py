@@ -17,8 +17,6 @@ from pydantic import BaseModel
 import hno
 from hno.data.store import replace_whole
 
-SCHEMA = 2
-"""Version of results.json."""
 PACKAGES = ("torch", "lightning", "torchmetrics", "hydra-core", "omegaconf", "wandb", "scipy", "safetensors")
 
 
@@ -73,7 +71,7 @@ class Results:
     def __init__(self, path: Path, head: Mapping[str, Any]) -> None:
         self.path = path
         self.content: dict[str, Any] = {
-            "schema": SCHEMA, "status": "running", "reason": None, **head, "seconds": {}, "table": [],
+            "status": "running", "reason": None, **head, "seconds": {}, "table": [],
             "episodes": None, "versions": versions(),
         }  # fmt: skip
         self.write()

@@ -18,7 +18,7 @@ def _array(value: Any) -> Array:
 class Episode(BaseModel):
     """One closed-loop episode; F frames, P players, d dimensions."""
 
-    model_config = ConfigDict(frozen=True, arbitrary_types_allowed=True)
+    model_config = ConfigDict(frozen=True, arbitrary_types_allowed=True, allow_inf_nan=False)
 
     theta: tuple[float, ...]
     kind: str = ""

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from hno.report.episode import Array, Episode
-from hno.report.page_data import identity
 from hno.report.records import Run
+from hno.report.tables import names_of
 from hno.report.verdicts import at, clearance
 
 MOST = 400
@@ -112,7 +112,7 @@ def playable(run: Run, found: Episode) -> dict[str, Any]:
     views = {"top": 1, "side": 2} if found.positions.shape[2] == 3 else {"top": 1}
     collision = " · collision" if found.collided else ""
     return {
-        **identity(run), "title": f"{run.name} · {at(found.theta)} · {found.kind}{collision}",
+        **names_of(run, "any"), "title": f"{run.name} · {at(found.theta)} · {found.kind}{collision}",
         "said": described(run, found), "collided": found.collided, "closest": closest(found),
         "reach": round(reach(found), 2), "frames": frames(found),
         "whole": {view: whole(found, up) for view, up in views.items()},

@@ -145,10 +145,11 @@ def summary(sweep: Sweep, found: Sequence[Recipe]) -> str:
 
 def _recipe(recipe: Recipe) -> dict[str, Any]:
     spreads = {"rate_over_seeds": recipe.rates, "excess": recipe.excess}
+    counts = {name: value for name, value in recipe.pooled._asdict().items() if name != "relative_excess"}
     spreads |= {f"seconds_{stage}": recipe.seconds(stage) for stage in ("labels", "training", "total")}
     return {
         "game": recipe.game, "operator": recipe.operator, "activation": recipe.activation, "variant": recipe.variant,
-        "conditions": recipe.conditions, "seeds": [run.seed for run in recipe.runs], **recipe.pooled._asdict(),
+        "conditions": recipe.conditions, "seeds": [run.seed for run in recipe.runs], **counts,
         **{name: None if one is None else one._asdict() for name, one in spreads.items()},
         "types": [one._asdict() for one in recipe.types],
         "unfinished": recipe.unfinished, "failed": recipe.failed,

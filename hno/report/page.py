@@ -160,7 +160,7 @@ def _cards(runs: Sequence[Run], found: Sequence[Recipe]) -> list[Card]:
 
 def _choices(runs: Sequence[Run], name: str) -> list[str]:
     values = {getattr(run, name) for run in runs}
-    return [plain(value) for value in sorted(values, key=lambda value: (value is None, value or 0))]
+    return [plain(value) for value in sorted(values, key=lambda value: (value is None, 0 if value is None else value))]
 
 
 def _values(runs: Sequence[Run]) -> dict[str, set[str | None]]:

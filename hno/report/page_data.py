@@ -11,6 +11,7 @@ from hno.evaluation.format import counted
 from hno.evaluation.sections import plain
 from hno.report.recipes import Recipe, TypeCounts, pool
 from hno.report.records import Run
+from hno.report.tables import names_of
 from hno.report.verdicts import at, rate
 
 POINTS = 120
@@ -37,7 +38,7 @@ def comparison(recipes: Iterable[Recipe]) -> list[dict[str, Any]]:
 
 
 def _compared(recipe: Recipe) -> list[dict[str, Any]]:
-    names = {"game": recipe.game, "operator": recipe.operator, "activation": recipe.activation, "recipe": recipe.name}
+    names = {**names_of(recipe, "any"), "recipe": recipe.name}
     whole = recipe.pooled
     low, high = whole.interval or (None, None)
     tip = f"{recipe.name}, {counted(len(recipe.runs), 'seed')}\n{rate(whole)}"
@@ -57,7 +58,8 @@ def learning_curves(recipes: Iterable[Recipe], runs: Iterable[Run]) -> list[dict
     names = {run.name: recipe.name for recipe in recipes for run in recipe.runs}
     return [
         {
-            **identity(run),
+            **names_of(run, "any"),
+            "run": run.name,
             "recipe": names.get(run.name, f"{run.operator} / {run.activation}"),
             "metrics": {name: _thinned(curve) for name, curve in sorted(run.curves.items())},
         }
@@ -69,9 +71,3 @@ def learning_curves(recipes: Iterable[Recipe], runs: Iterable[Run]) -> list[dict
 def _thinned(curve: Sequence[tuple[int, float]]) -> list[list[float]]:
     kept = np.unique(np.linspace(0, len(curve) - 1, min(POINTS, len(curve))).round().astype(int))
     return [[curve[k][0], float(f"{curve[k][1]:.4g}")] for k in kept]
-
-
-def identity(run: Run) -> dict[str, Any]:
-    """What a run is filtered by, and its name."""
-    names = {"run": run.name, "game": run.game, "operator": run.operator, "activation": run.activation}
-    return {**names, "seed": plain(run.seed)}

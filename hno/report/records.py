@@ -30,7 +30,7 @@ class UnreadableError(ValueError):
 class Run(BaseModel):
     """One model: what results.json says of it, and what lies beside that file. Other entries are kept as they are."""
 
-    model_config = ConfigDict(frozen=True, strict=True, extra="allow")
+    model_config = ConfigDict(frozen=True, strict=True, extra="allow", allow_inf_nan=False)
 
     status: str
     reason: str | None = None
@@ -84,7 +84,7 @@ class Run(BaseModel):
         return self.model_extra or {}
 
 
-_ROW = TypeAdapter(TypeRow, config=ConfigDict(strict=True))
+_ROW = TypeAdapter(TypeRow, config=ConfigDict(strict=True, allow_inf_nan=False))
 
 
 def read_results(path: Path) -> list[dict[str, Any]]:

@@ -51,7 +51,7 @@ def _order(value: Any) -> float | None:
 
 
 def names_of(entry: Run | Recipe, level: str) -> dict[str, str]:
-    """What an element of the page is filtered by."""
+    """What an element of the page is filtered by; its level is "recipe", "run" or "any"."""
     seed = {"seed": plain(entry.seed)} if isinstance(entry, Run) else {}
     return {"level": level, "game": entry.game, "operator": entry.operator, "activation": entry.activation, **seed}
 

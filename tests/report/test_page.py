@@ -136,7 +136,7 @@ def test_two_hundred_runs_say_which_episodes_are_left_out(big):
     shown = len(page.data["episodes"])
     assert shown == episodes.MOST < total
     assert f"{shown:,} of {total:,} episodes are in this page" in text
-    told = {entry["run"] for entry in page.data["episodes"] if " · worst" in entry["title"]}
+    told = {entry["title"].split(" · ")[0] for entry in page.data["episodes"] if " · worst" in entry["title"]}
     assert told == {run.name for run in sweep.runs if run.episodes}
 
 

@@ -101,6 +101,7 @@ def test_a_folder_without_runs_is_refused(tmp_path, folder):
         (row((1.0, 1.0), 3) | {"collisions": None}, "outcome.collisions: input should be a valid integer, got None"),
         (row((1.0, 1.0), 3) | {"safe_starts": True}, "outcome.safe_starts: input should be a valid integer, got True"),
         (row((1.0, 1.0), 3) | {"theta": "1,1"}, "theta"),
+        (row((1.0, 1.0), 3) | {"median_excess_cost": float("nan")}, "finite"),
         (row((1.0, 1.0), 3) | {"theta": [1, None]}, "theta"),
         ("nonsense", "expected an object, got 'nonsense'"),
     ],
