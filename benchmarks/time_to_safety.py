@@ -19,7 +19,6 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-from hydra import compose, initialize_config_dir
 from rich.console import Console
 from rich.table import Table
 
@@ -33,9 +32,8 @@ from hno.data.labels import labels_for
 def measure(game: str, seed: int, starts: int, threads: int, overrides: list[str]) -> dict[str, Any]:
     """One game and seed."""
     fixed = [f"game={game}", f"seed={seed}", f"validation.starts={starts}", f"trainer.threads={threads}", "logger=csv"]
-    with initialize_config_dir(str(config_dir()), version_base=None):
-        config = compose("train", overrides=["experiment=fast", *fixed, *overrides])
-    data = build_data(config, build_game(config), frozenset({"bvp"}))
+    settings = train_settings(["experiment=fast", *fixed, *overrides])
+    data = build_data(settings, build_game(settings.game), frozenset({"bvp"}))
     with tempfile.TemporaryDirectory() as folder:
         found, labels = labels_for(data.game, data.requests, Path(folder))
     with tempfile.TemporaryDirectory() as folder:
