@@ -23,7 +23,7 @@ from rich.console import Console
 from rich.table import Table
 
 from hno.cli.build import build_data, build_game
-from hno.cli.config import config_dir
+from hno.cli.calls import train_settings
 from hno.cli.results import Results
 from hno.cli.train import train_operator
 from hno.data.labels import labels_for
@@ -39,7 +39,7 @@ def measure(game: str, seed: int, starts: int, threads: int, overrides: list[str
     with tempfile.TemporaryDirectory() as folder:
         results = Results(Path(folder) / "results.json", {})
         began = time.perf_counter()
-        train_operator(config, Path(folder), results)
+        train_operator(settings, Path(folder), results)
         whole = time.perf_counter() - began
     seconds, best = results.content["seconds"], results.content["validation"]
     rate = best["collision_rate"]
