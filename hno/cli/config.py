@@ -17,7 +17,7 @@ from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.plugins import Plugins
-from hydra.errors import HydraException
+from hydra.errors import HydraException, OverrideParseException
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -169,8 +169,11 @@ def _swept(name: str, experiment: Sequence[str]) -> set[str]:
 
 def compose(name: str, overrides: Sequence[str]) -> DictConfig:
     """A configuration as Hydra composes it, without a job; interpolations that name `hydra` work."""
-    with hydra.initialize_config_dir(str(config_dir()), version_base="1.3"):
-        config = hydra.compose(name, overrides=list(overrides), return_hydra_config=True)
+    try:
+        with hydra.initialize_config_dir(str(config_dir()), version_base="1.3"):
+            config = hydra.compose(name, overrides=list(overrides), return_hydra_config=True)
+    except OverrideParseException as error:
+        raise SettingsError(f"{error.override} cannot be read: {str(error).splitlines()[0]}.") from error
     HydraConfig.instance().set_config(config)
     OmegaConf.set_struct(config, False)
     del config["hydra"]

@@ -14,6 +14,7 @@ from omegaconf import OmegaConf
 
 from hno.cli.arguments import Arguments
 from hno.cli.config import choices, compose, config_dir, for_hydra, groups
+from hno.cli.schema import SettingsError
 
 BESIDE = 44
 """The column of comments."""
@@ -24,7 +25,7 @@ def configuration_help(name: str, given: Arguments) -> str:
     overrides = for_hydra(name, given)
     try:
         config = compose(name, overrides)
-    except HydraException:  # values of a sweep, or mistakes of which a run will speak
+    except (HydraException, SettingsError):  # values of a sweep, or mistakes of which a run will speak
         config = compose(name, [])
     said = dict(comments((config_dir() / f"{name}.yaml").read_text(encoding="utf-8")))
     parts = []

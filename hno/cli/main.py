@@ -103,6 +103,9 @@ def main(given: Sequence[str] | None = None, prog: str | None = None) -> int:
     except UsageError as error:
         print(error, file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        print("Interrupted.", file=sys.stderr)
+        return 130
 
 
 def _run(command: Command, given: Arguments, prog: str) -> int:

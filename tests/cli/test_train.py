@@ -140,9 +140,9 @@ def test_run_leaves_a_picture_of_an_episode(command: Command, monkeypatch: pytes
 
 def test_label_sizes_are_the_scales_of_the_network(command: Command) -> None:
     scaled = command("train", *SMOKE, "trainer.max_steps=1")
-    assert float(weights(scaled.folder)["value_scale"]) > 1
+    assert float(weights(scaled.folder)["operator.value_scale"]) > 1
     physical = command("train", *SMOKE, "trainer.max_steps=1", "loss.scaled=false")
-    assert float(weights(physical.folder)["value_scale"]) == 1
+    assert float(weights(physical.folder)["operator.value_scale"]) == 1
 
 
 SIX = (*SMOKE, "trainer.max_steps=6", "trainer.validate_every=3", "trainer.print_every=1")

@@ -260,7 +260,7 @@ def test_later_starts_are_solved_once_and_only_when_none_of_the_first_collides(
         asked.append(1)
         return [labelled([first] * 2 + [CLOSE] * 6)]
 
-    callback.begin([labelled([first] * 2)], Later(8, solve))
+    callback.begin([labelled([first] * 2)], Later(20, solve))
     found = [callback.consider(Trainer(), module) for _ in range(2)]
     assert len(asked) == solved
     rate = 6 / 8 if solved else 1.0
