@@ -43,7 +43,21 @@ lint: $(STAMP) ## ruff and mypy
 test: lint ## lint, then the tests that are not slow; more options in ARGS
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 $(ARGS)
 
+# The site is built from the sources' text: neither hno nor torch is installed here, which makes it a matter of seconds.
+DOCS := .venv-docs
+DOCS_EXTRA := import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]["docs"])
+
+$(DOCS)/.stamp: pyproject.toml constraints.txt
+	$(PYTHON) -m venv --clear $(DOCS)
+	@$(DOCS)/bin/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt \
+	    $$($(DOCS)/bin/python -c '$(DOCS_EXTRA)')
+	@touch $@
+
+.PHONY: docs
+docs: $(DOCS)/.stamp ## build the documentation into site/; broken links are errors
+	NO_MKDOCS_2_WARNING=1 $(DOCS)/bin/mkdocs build --strict
+
 .PHONY: clean
-clean: ## remove the environment, caches and builds, but no results
-	rm -rf $(VENV) build dist .mypy_cache .ruff_cache .pytest_cache *.egg-info
+clean: ## remove the environments, caches and builds, but no results
+	rm -rf $(VENV) $(DOCS) site build dist .mypy_cache .ruff_cache .pytest_cache *.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,6 +1,8 @@
 """Evaluate a checkpoint: errors, closed-loop safety, report."""
 
-from hno.cli.evaluate import main
+import sys
+
+from hno.cli.main import main
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main(["evaluate", *sys.argv[1:]], "python evaluate.py"))

@@ -1,6 +1,8 @@
 """Train a value operator: build from the config, fit, evaluate, write results."""
 
-from hno.cli.train import main
+import sys
+
+from hno.cli.main import main
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main(["train", *sys.argv[1:]], "python train.py"))

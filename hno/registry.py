@@ -1,4 +1,4 @@
-"""Names for classes: a decorator, discovery on first use, and errors that help."""
+"""Names for classes and functions: a decorator, discovery on first use, and errors that help."""
 
 from __future__ import annotations
 
@@ -6,53 +6,75 @@ import difflib
 import importlib
 import inspect
 import pkgutil
+import traceback
+import warnings
 from collections.abc import Callable, Collection
-from importlib.metadata import entry_points
-from typing import Any, Generic, TypeVar
+from functools import partial
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any, Generic, NamedTuple, TypeVar
 
 T = TypeVar("T")
+F = TypeVar("F", bound=Callable[..., Any])
 
 
 class UnknownNameError(KeyError):
-    """A name that no class is registered under."""
+    """A name that nothing is registered under."""
 
     def __str__(self) -> str:
         """The message without the quotes that KeyError adds."""
         return str(self.args[0])
 
 
-class Registry(Generic[T]):
-    """A mapping from names to classes of one kind.
+class BrokenPluginWarning(UserWarning):
+    """A module or an entry point that could not be loaded."""
 
-    The modules of `package` and the entry points of group `hno.<kind>s` are imported on the first look-up, so a plugin
-    costs nothing until it is asked for.
+
+class Description(NamedTuple):
+    """What a registered name stands for."""
+
+    name: str
+    summary: str
+    """First line of the docstring."""
+    origin: str
+    """Distribution and version that it comes from, or its module where no distribution offers it."""
+
+
+class Registry(Generic[T]):
+    """A mapping from names to classes of one kind, or to functions that build such objects.
+
+    The modules of `package` and the entry points of the group `hno.<kinds>` are imported on the first look-up, so a
+    plugin costs nothing until it is asked for. What cannot be imported is left out with a warning, see `broken`.
 
     Args:
-        kind: what the classes are, in the singular ("game"); it appears in errors and names the entry-point group.
+        kind: what the classes are, in the singular ("game"); it appears in errors.
         package: the package whose modules register classes, e.g. "hno.games".
     """
 
     def __init__(self, kind: str, package: str) -> None:
         self.kind = kind
         self.package = package
+        self.group = f"hno.{plural(kind)}"
+        self.broken: dict[str, str] = {}
+        """What could not be loaded, and why: "ModuleNotFoundError: ... (file:line)"."""
         self._classes: dict[str, type[T]] = {}
+        self._origins: dict[str, str] = {}
         self._discovered = False
 
-    def register(self, name: str) -> Callable[[type[T]], type[T]]:
-        """Class decorator that files the class under `name`.
+    def register(self, name: str) -> Callable[[F], F]:
+        """Decorator that files a class, or a function that builds an object, under `name`.
 
         Raises:
             ValueError: another class already has that name.
         """
 
-        def decorate(cls: type[T]) -> type[T]:
+        def decorate(cls: F) -> F:
             known = self._classes.get(name)
-            if known is not None and (known.__module__, known.__qualname__) != (cls.__module__, cls.__qualname__):
+            if known is not None and _place(known) != _place(cls):
                 raise ValueError(
-                    f"The {self.kind} name {name!r} is taken by {known.__module__}.{known.__qualname__}. "
-                    f"Register {cls.__module__}.{cls.__qualname__} under another name."
+                    f"The {self.kind} name {name!r} is taken by {_place(known)}. "
+                    f"Register {_place(cls)} under another name."
                 )
-            self._classes[name] = cls
+            self._classes[name] = cls  # type: ignore[assignment]  # a function is called as a class is
             return cls
 
         return decorate
@@ -63,14 +85,15 @@ class Registry(Generic[T]):
         return sorted(self._classes)
 
     def get(self, name: str) -> type[T]:
-        """The class filed under `name`.
+        """The class or function filed under `name`.
 
         Raises:
-            UnknownNameError: no such name; the message lists the known ones and the nearest.
+            UnknownNameError: no such name; the message lists the known ones, the nearest and what could not be loaded.
         """
         self._discover()
         if name not in self._classes:
-            raise UnknownNameError(unknown_name(self.kind, name, self.names()))
+            failed = "".join(f" Could not be loaded: {what}: {why}." for what, why in self.broken.items())
+            raise UnknownNameError(unknown_name(self.kind, name, self.names()) + failed)
         return self._classes[name]
 
     def name_of(self, cls: type[T]) -> str:
@@ -84,15 +107,58 @@ class Registry(Generic[T]):
                 return name
         raise UnknownNameError(f"{cls.__qualname__} is not a registered {self.kind}. Known: {', '.join(self.names())}.")
 
+    def describe(self, name: str) -> Description:
+        """What `name` stands for and where it comes from. Raises as `get`."""
+        found = self.get(name)
+        module = found.__module__
+        origin = "hno" if module.split(".")[0] == "hno" else module
+        return Description(name, (inspect.getdoc(found) or "").split("\n")[0], self._origins.get(name, origin))
+
     def _discover(self) -> None:
         if self._discovered:
             return
-        package = importlib.import_module(self.package)
-        for module in pkgutil.iter_modules(package.__path__):
-            importlib.import_module(f"{self.package}.{module.name}")
-        for point in entry_points(group=f"hno.{self.kind}s"):
-            self.register(point.name)(point.load())
-        self._discovered = True
+        self._discovered = True  # modules that are imported now may look up names themselves
+        for module in pkgutil.iter_modules(importlib.import_module(self.package).__path__):
+            path = f"{self.package}.{module.name}"
+            self._attempt(path, partial(importlib.import_module, path))
+        for point in entry_points(group=self.group):
+            self._attempt(f'{point.name} = "{point.value}" of {origin_of(point)}', partial(self._load, point))
+
+    def _load(self, point: EntryPoint) -> None:
+        self.register(point.name)(point.load())
+        self._origins[point.name] = origin_of(point)
+
+    def _attempt(self, what: str, load: Callable[[], object]) -> None:
+        """Load a part; one that fails is named and does not stop the others."""
+        try:
+            load()
+        except Exception as error:  # noqa: BLE001  # whatever a plugin raises
+            self.broken[what] = _reason(error)
+            message = f"{what} cannot be loaded, so its {self.kind} is missing: {self.broken[what]}."
+            warnings.warn(message, BrokenPluginWarning, stacklevel=4)
+
+
+def plural(kind: str) -> str:
+    """The plural of a kind, as entry-point groups have it: "games", "losses"."""
+    return kind + ("es" if kind.endswith("s") else "s")
+
+
+def origin_of(point: EntryPoint) -> str:
+    """Name and version of the distribution that offers an entry point."""
+    return f"{point.dist.name} {point.dist.version}" if point.dist is not None else point.module
+
+
+def _place(cls: Callable[..., Any]) -> str:
+    return f"{cls.__module__}.{cls.__qualname__}"
+
+
+def _reason(error: Exception) -> str:
+    """An error in one line, with the file and the line that it comes from."""
+    text = " ".join(f"{type(error).__name__}: {error}".split())
+    if isinstance(error, SyntaxError):
+        return text if error.filename is None else f"{text} ({error.filename})"
+    frames = [f for f in traceback.extract_tb(error.__traceback__) if not f.filename.startswith("<frozen")]
+    return f"{text} ({frames[-1].filename}:{frames[-1].lineno})"
 
 
 def unknown_name(kind: str, name: str, known: list[str]) -> str:

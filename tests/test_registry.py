@@ -3,12 +3,22 @@
 from __future__ import annotations
 
 import importlib
+import inspect
+import os
+import subprocess
 import sys
+from dataclasses import replace
 from importlib.metadata import EntryPoint
+from pathlib import Path
 
 import pytest
 
-from hno.registry import Registry, UnknownNameError
+import hno
+from hno.cli.kinds import REGISTRIES
+from hno.data import make_sampler
+from hno.games import make
+from hno.operators import Architecture, make_operator
+from hno.registry import BrokenPluginWarning, Registry, UnknownNameError, check_options, options_of
 
 PACKAGE = """
 from hno.registry import Registry
@@ -30,8 +40,18 @@ class Lion:
 """
 PLUGIN = """
 class Axolotl:
-    pass
+    "A salamander that stays young."
 """
+GROUPS = {
+    "game": "hno.games",
+    "operator": "hno.operators",
+    "network": "hno.networks",
+    "activation": "hno.activations",
+    "loss": "hno.losses",
+    "source": "hno.sources",
+    "optimizer": "hno.optimizers",
+}
+"""The entry-point group of every kind."""
 NAMES = ("zoo_for_tests", "zoo_for_tests.savanna", "pond_for_tests")
 
 
@@ -130,8 +150,109 @@ def test_a_taken_name_is_refused(animals):
 
 def test_a_plugin_may_not_take_a_known_name(animals, installed):
     installed.install("lion", "Axolotl")
-    with pytest.raises(ValueError, match=r"animal name 'lion' is taken by zoo_for_tests.savanna.Lion"):
-        animals.names()
+    with pytest.warns(BrokenPluginWarning, match=r"animal name 'lion' is taken by zoo_for_tests.savanna.Lion"):
+        assert animals.names() == ["lion", "zebra"]
+    assert animals.get("lion").__name__ == "Lion"
+
+
+def test_what_cannot_be_loaded_is_named_and_stops_nothing_else(animals, installed, tmp_path):
+    broken = tmp_path / "zoo_for_tests" / "aviary.py"
+    broken.write_text("import nothing_of_that_name\n", encoding="utf-8")
+    (tmp_path / "zoo_for_tests" / "basin.py").write_text("def (:\n", encoding="utf-8")
+    installed.install("newt", "Newt")
+    installed.install("axolotl", "Axolotl")
+    with pytest.warns(BrokenPluginWarning) as caught:
+        assert animals.names() == ["axolotl", "lion", "zebra"]
+    assert len(caught) == 3
+    assert all("so its animal is missing" in str(warning.message) for warning in caught)
+    with pytest.raises(UnknownNameError) as error:
+        animals.get("newt")
+    said = str(error.value)
+    assert said.startswith("No animal named 'newt'. Known: axolotl, lion, zebra. Could not be loaded: ")
+    assert f"ModuleNotFoundError: No module named 'nothing_of_that_name' ({broken}:1)" in said
+    assert "zoo_for_tests.basin: SyntaxError" in said
+    assert "basin.py" in said
+    assert 'newt = "pond_for_tests:Newt"' in said
+
+
+def test_a_description_is_the_first_line_and_the_origin(animals, installed):
+    installed.install("axolotl", "Axolotl")
+    assert animals.describe("axolotl") == ("axolotl", "A salamander that stays young.", "pond_for_tests")
+    assert animals.describe("lion") == ("lion", "", "zoo_for_tests.savanna")
+
+
+def test_functions_are_registered_as_classes_are(animals):
+    @animals.register("hatched")
+    def hatch(eggs=3):
+        """A clutch."""
+
+    assert animals.get("hatched") is hatch
+    assert animals.describe("hatched").summary == "A clutch."
+    assert options_of(animals.get("hatched")) == {"eggs": 3}
+
+
+def test_unknown_options_are_answered_with_the_known_ones_and_the_nearest():
+    def hatch(nest, eggs=3, *others, warm=True, **more):
+        pass
+
+    assert options_of(hatch, skip=("nest",)) == {"eggs": 3, "warm": True}
+    check_options("clutch", hatch, {"eggs": 4}, skip=("nest",))
+    with pytest.raises(UnknownNameError) as caught:
+        check_options("clutch", hatch, {"egs": 4}, skip=("nest",))
+    assert str(caught.value) == "No option of clutch named 'egs'. Known: eggs, warm. Did you mean 'eggs'?"
+
+
+@pytest.mark.parametrize(
+    ("kind", "group"), [("game", "hno.games"), ("loss", "hno.losses"), ("activation", "hno.activations")]
+)
+def test_groups_of_entry_points_are_plurals(kind, group):
+    assert Registry(kind, "zoo_for_tests").group == group
+
+
+PROJECT = """
+[build-system]
+requires = ["setuptools"]
+build-backend = "setuptools.build_meta"
+
+[project]
+name = "menagerie"
+version = "0.3"
+
+[tool.setuptools]
+py-modules = ["menagerie"]
+"""
+MENAGERIE = """
+class {name}:
+    "One of another package."
+"""
+
+
+def test_every_group_takes_an_installed_package(tmp_path):
+    """One real package offers a class of every kind and is installed by pip; another interpreter looks them up."""
+    source, site = tmp_path / "source", tmp_path / "site"
+    source.mkdir()
+    points = [
+        f'[project.entry-points."{registry().group}"]\nforeign = "menagerie:{kind.title()}"'
+        for kind, registry in REGISTRIES.items()
+    ]
+    (source / "pyproject.toml").write_text(PROJECT + "\n".join(points), encoding="utf-8")
+    classes = [MENAGERIE.format(name=kind.title()) for kind in REGISTRIES]
+    (source / "menagerie.py").write_text("\n".join(classes), encoding="utf-8")
+    pip = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--no-index", "--no-build-isolation"]
+    subprocess.run([*pip, "--target", site, source], check=True, capture_output=True, text=True)
+    path = os.pathsep.join([str(site), str(Path(hno.__file__).parent.parent)])
+    code = (
+        "from hno.cli.kinds import REGISTRIES\n"
+        "for kind, registry in REGISTRIES.items():\n"
+        "    print(kind, *registry().describe('foreign'), registry().group, sep='|')"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines() == [
+        f"{kind}|foreign|One of another package.|menagerie 0.3|{group}" for kind, group in GROUPS.items()
+    ]
 
 
 def test_registering_a_class_twice_is_harmless(animals):
@@ -150,8 +271,51 @@ def test_classes_know_their_names(animals):
     [
         ("hno.games", "games", {"drone", "lane_change", "narrow_road"}),
         ("hno.losses", "losses", {"boundary", "costate", "residual", "value"}),
-        ("hno.operators", "operators", {"hno", "sno"}),
+        ("hno.operators", "operators", {"gradient"}),
+        ("hno.operators", "networks", {"deeponet"}),
+        ("hno.operators", "activations", {"relu", "sin", "tanh"}),
+        ("hno.data", "sources", {"band", "box", "labels", "rollout"}),
+        ("hno.training.optimizers", "optimizers", {"adam", "adamw", "muon", "soap"}),
     ],
 )
 def test_the_package_registers_what_it_ships(module, name, known):
     assert known <= set(getattr(importlib.import_module(module), name).names())
+
+
+class Kettle:
+    def __init__(self, litres: float, whistle: bool = True) -> None:
+        self.litres, self.whistle = litres, whistle
+
+
+def test_options_are_the_arguments_and_their_defaults():
+    assert options_of(Kettle) == {"litres": inspect.Parameter.empty, "whistle": True}
+    assert options_of(Kettle, skip=("litres",)) == {"whistle": True}
+
+
+def test_an_unknown_option_comes_with_the_known_ones_and_the_nearest():
+    check_options("kettle", Kettle, ["whistle", "litres"])
+    with pytest.raises(UnknownNameError, match=r"No option of kettle named 'whistel'\. Known: litres, whistle\. Did"):
+        check_options("kettle", Kettle, ["litres", "whistel"])
+    with pytest.raises(UnknownNameError, match=r"Known: whistle\.$"):
+        check_options("kettle", Kettle, ["litres"], skip=("litres",))
+    with pytest.raises(UnknownNameError, match=r"Known: none\.$"):
+        check_options("box", lambda: None, ["x"])
+
+
+@pytest.mark.parametrize(
+    ("part", "options"),
+    [("operator", ("game", "network")), ("network", ("inputs", "activation")), ("activation", ())],
+)
+def test_an_operator_refuses_options_that_its_parts_do_not_know(part, options):
+    for option in ("widht", *options):
+        wrong = replace(Architecture(), **{part: replace(getattr(Architecture(), part), options={option: 1})})
+        with pytest.raises(UnknownNameError, match=rf"No option of {part} \w+ named '{option}'\. Known: "):
+            make_operator(make("narrow_road"), wrong)
+
+
+@pytest.mark.parametrize("name", ["box", "band", "labels", "rollout"])
+def test_a_source_refuses_options_that_it_does_not_know(name):
+    with pytest.raises(UnknownNameError, match=f"No option of source {name} named 'raech'. Known: "):
+        make_sampler({name: {"share": 1.0, "raech": 2.0}})
+    with pytest.raises(UnknownNameError, match=r"No source named 'bix'\. Known: band, box, .*Did you mean 'box'"):
+        make_sampler({"bix": 1.0, name: 1.0})

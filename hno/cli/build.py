@@ -1,123 +1,107 @@
-"""From configuration to objects."""
+"""From the settings of a training to its objects."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import warnings
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
-from hno.cli.checks import flag, is_number, whole_number
+from hno.cli.checkpoints import resumed
+from hno.cli.config import read
+from hno.cli.evaluate import check_evaluation, unseen_types
 from hno.cli.results import plain
+from hno.cli.schema import GameSettings, TrainSettings
+from hno.cli.starts import cache_folder
 from hno.data import Collocation, GameData, LabelPlan, make_sampler
 from hno.data.curriculum import Curriculum
-from hno.data.labels import Report, default_cache
+from hno.data.labels import Report
+from hno.evaluation.kernels import check_rows
 from hno.games import Game, make
+from hno.games.grid import parse_types
 from hno.losses import Objective, make_objective
-from hno.operators import Architecture, Choice
+from hno.operators import Architecture, Choice, ValueOperator, make_operator
 from hno.training.fit import Settings
-
-SIZES = (
-    "data.trajectories", "data.validation", "data.workers", "trainer.max_steps",
-    "trainer.validate_every", "trainer.print_every", "trainer.threads", "evaluation.starts",
-)  # fmt: skip
-"""Entries that must be whole and positive where they are set."""
-FLAGS = (
-    "operator.exact_terminal", "loss.scaled", "loss.balance", "trainer.compile", "validation.stop_when_safe",
-    "evaluation.safe", "evaluation.ntk",
-)  # fmt: skip
-"""Entries that are true or false."""
+from hno.training.optimizers import make_optimizer
 
 
-def check_numbers(config: DictConfig) -> None:
-    """Raise ValueError for sizes and rates that are not positive, and shares of the run outside [0, 1]."""
-    for name in SIZES:
-        value = OmegaConf.select(config, name)
-        if value is not None:
-            whole_number(name, value, 1)
-    for name in ("optimizer.lr", "optimizer.final_lr"):
-        value = OmegaConf.select(config, name)
-        if not (is_number(value) and value > 0):
-            raise ValueError(f"{name} must be a positive number; got {value!r}.")
-    for name in FLAGS:
-        value = OmegaConf.select(config, name)
-        if value is not None:
-            flag(name, value)
-    whole_number("trainer.polish", config.trainer.polish, 0)
-    whole_number("seed", config.seed, 0)
-    for name in ("data.pretrain", "data.widening", "data.finish"):
-        value = OmegaConf.select(config, name)
-        if not (is_number(value) and 0 <= value <= 1):
-            raise ValueError(f"{name} is a share of the run and must lie in [0, 1]; got {value!r}.")
+def check(config: DictConfig) -> TrainSettings:
+    """The settings of a run that can be made; nothing is solved or written.
+
+    Raises:
+        ValueError, LookupError: entries that are unknown or make no sense, together or for the game.
+    """
+    settings = read(TrainSettings, config)
+    with warnings.catch_warnings(action="ignore"):  # the run warns
+        game = build_game(settings.game)
+        check_evaluation(game, settings.evaluation)
+        unseen_types(game, settings.evaluation.types, "evaluation.types")
+        if settings.validation.types is not None:
+            parse_types(game, settings.validation.types, key="validation.types")
+        operator, objective = make_operator(game, build_architecture(settings)), build_objective(settings)
+        build_data(settings, game, streams(objective, operator))
+        make_optimizer(steps=settings.trainer.max_steps, **settings.optimizer)
+        if settings.evaluation.ntk:
+            check_rows(operator, settings.evaluation.ntk_rows)
+    if settings.resume is not None:
+        resumed(settings.resume)
+    return settings
 
 
-def build_game(config: DictConfig) -> Game:
+def build_game(settings: GameSettings) -> Game:
     """The chosen game with its changed constants."""
-    return make(config.game.name, **plain(config.game.constants))
+    return make(settings.name, **settings.constants)
 
 
-def build_architecture(config: DictConfig) -> Architecture:
+def build_architecture(settings: TrainSettings) -> Architecture:
     """What the operator is built of."""
-    options = plain(config.operator)
-    del options["name"]  # that of the method
-    return Architecture(
-        Choice(options.pop("function"), options), _choice(plain(config.network)), _choice(plain(config.activation))
-    )
+    options = {name: value for name, value in settings.operator.items() if name not in ("name", "function")}
+    function = Choice(settings.operator["function"], options)
+    return Architecture(function, _choice(settings.network), _choice(settings.activation))
 
 
 def _choice(content: dict[str, Any]) -> Choice:
-    return Choice(content.pop("name"), content)
+    return Choice(content["name"], {name: value for name, value in content.items() if name != "name"})
 
 
-def build_objective(config: DictConfig) -> Objective:
-    """The method: loss terms and weights; entries that are null are left out."""
-    options = plain(config.loss)
-    terms, weights = (_set(options.pop(name)) for name in ("terms", "weights"))
-    return make_objective(terms, weights, **options)
+def build_objective(settings: TrainSettings) -> Objective:
+    """The method: loss terms and weights."""
+    return make_objective(**plain(settings.loss))
 
 
-def _set(content: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in content.items() if value is not None}
+def streams(objective: Objective, operator: ValueOperator) -> frozenset[str]:
+    """Streams of data that the terms of an objective read."""
+    return frozenset(term.stream for term in objective.used(exact_terminal=operator.meets_terminal).values())
 
 
-def build_data(config: DictConfig, game: Game, streams: frozenset[str], report: Report | None = None) -> GameData:
+def build_data(settings: TrainSettings, game: Game, needed: frozenset[str], report: Report | None = None) -> GameData:
     """The streams that the objective's terms read."""
-    data, steps = config.data, config.trainer.max_steps
+    data, steps = settings.data, settings.trainer.max_steps
     finish = round((1 - data.finish) * steps) if data.finish else None
     curriculum = Curriculum(round(data.pretrain * steps), round(data.widening * steps), finish)
-    return GameData(
-        game,
-        streams,
-        config.seed,
-        LabelPlan(
-            types=game.validate_types(data.types),
-            trajectories=data.trajectories,
-            validation=data.validation,
-            files=[Path(file) for file in data.files],
-            cache=cache_folder(data.cache),
-            workers=data.workers,
-        ),
-        Collocation(make_sampler(plain(config.sampler)), curriculum, data.interior_types),
-        plain(data.batch_sizes),
-        report,
+    none = data.types in (None, []) and data.files  # those of the files alone
+    labels = LabelPlan(
+        types=() if none else parse_types(game, data.types),
+        trajectories=data.trajectories,
+        validation=data.validation,
+        files=[Path(file) for file in data.files],
+        cache=cache_folder(data.cache),
+        workers=data.workers,
     )
+    collocation = Collocation(make_sampler(settings.sampler), curriculum, data.interior_types)
+    return GameData(game, needed, settings.seed, labels, collocation, plain(data.batch_sizes), report)
 
 
-def cache_folder(choice: str | None) -> Path:
-    """The folder of label files."""
-    return Path(choice) if choice is not None else default_cache()
-
-
-def build_settings(config: DictConfig) -> Settings:
+def build_settings(settings: TrainSettings) -> Settings:
     """How to train."""
-    trainer = config.trainer
+    trainer = settings.trainer
     return Settings(
         steps=trainer.max_steps,
-        optimizer=plain(config.optimizer),
+        optimizer=settings.optimizer,
         validate_every=trainer.validate_every,
-        stop_when_safe=config.validation.stop_when_safe,
-        dt=config.evaluation.dt,
+        stop_when_safe=settings.validation.stop_when_safe,
+        dt=settings.evaluation.dt,
         accelerator=trainer.accelerator,
         devices=trainer.devices,
         precision=trainer.precision,

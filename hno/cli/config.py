@@ -1,34 +1,33 @@
-"""Where the configuration lies, what may be chosen, and messages for choices that do not exist."""
+"""Where configurations lie, what may be chosen in them, and how they are composed."""
 
 from __future__ import annotations
 
-import logging
-import os
+import importlib.util
+import inspect
 import re
-import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
 import hydra
+from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.plugins import Plugins
 from hydra.errors import HydraException
-from omegaconf import DictConfig
+from hydra.plugins.search_path_plugin import SearchPathPlugin
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
 import hno
-from hno.cli import pages
-from hno.cli.results import Results
-from hno.cli.sweep import Job, show_jobs
-from hno.games import games
-from hno.operators import activations, networks
-from hno.registry import Registry, unknown_name
+from hno.cli.arguments import Arguments, UsageError, rewritten
+from hno.cli.kinds import GIVEN, REGISTRIES
+from hno.cli.schema import S, SettingsError, validated
+from hno.registry import options_of, plural, unknown_name
 
-log = logging.getLogger(__name__)
-
-PLUGGABLE: dict[str, Registry[Any]] = {"game": games, "network": networks, "activation": activations}
-"""Groups whose choices are registered classes."""
+CHOSEN = ("game", "operator", "network", "activation", "optimizer")
+"""Groups whose choices are registered; methods of `operator` are files, its functions become methods."""
 
 
 def config_dir() -> Path:
@@ -40,103 +39,218 @@ def config_dir() -> Path:
     return found
 
 
+class Folders(SearchPathPlugin):
+    """Folders of configuration files besides our own: `conf` of packages that offer plugins, and --config-dir."""
+
+    own: Sequence[Path] = ()
+    """The user's."""
+
+    @classmethod
+    def all(cls) -> list[Path]:
+        """Every folder, ours first."""
+        points = [point for kind in REGISTRIES for point in entry_points(group=f"hno.{plural(kind)}")]
+        specs = (importlib.util.find_spec(name) for name in sorted({point.module.split(".")[0] for point in points}))
+        places = [Path(place) for spec in specs if spec for place in spec.submodule_search_locations or ()]
+        offered = [place / "conf" for place in places if (place / "conf").is_dir()]
+        return [config_dir(), *offered, *cls.own]
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        """Hydra's hook."""
+        for folder in self.all()[1:]:
+            search_path.append("hno", f"file://{folder.resolve()}")
+
+
+def groups(name: str) -> list[str]:
+    """Groups that a root configuration composes."""
+    defaults: Any = OmegaConf.select(OmegaConf.load(config_dir() / f"{name}.yaml"), "defaults") or []
+    return [str(group) for entry in defaults if OmegaConf.is_dict(entry) for group in entry]
+
+
+def folders() -> set[str]:
+    """Names of all groups that there are."""
+    return {path.name for folder in Folders.all() for path in folder.iterdir() if path.is_dir()}
+
+
+def choices(group: str) -> dict[str, Path | None]:
+    """Choices of a group and their files; those of plugins without a file have none. Nothing is imported."""
+    found: dict[str, Path | None] = {}
+    if group in CHOSEN:
+        found = {point.name: None for point in entry_points(group=f"hno.{plural(group)}")}
+    files = (path for folder in Folders.all() for path in (folder / group).glob("*.yaml"))
+    return dict(sorted({**found, **{path.stem: path for path in files}}.items()))
+
+
 def register_plugins() -> None:
-    """Make every registered name a choice of its group, also those without a yaml file."""
-    for group, registry in PLUGGABLE.items():
+    """Make every registered name without a file a choice of its group, with its options and their defaults."""
+    for group in CHOSEN:
+        registry, have = REGISTRIES[group](), choices(group)
         for name in registry.names():
-            if not (config_dir() / group / f"{name}.yaml").exists():
-                node: dict[str, Any] = {"game": {"name": name, "constants": {}}} if group == "game" else {"name": name}
-                package = "_global_" if group == "game" else None
+            if have.get(name) is None and (group, name) != ("operator", "gradient"):  # that of our own methods
+                options = options_of(registry.get(name), skip=GIVEN.get(group, ()))
+                node = _NODES.get(group, dict)({"name": name, **_writable(options)})
+                package = "_global_" if group in _NODES else None
                 ConfigStore.instance().store(group=group, name=name, node=node, package=package)
 
 
-def choices(group: str) -> list[str]:
-    """Choices of a configuration group."""
-    names = {path.stem for path in (config_dir() / group).glob("*.yaml")}
-    return sorted(names | set(PLUGGABLE[group].names() if group in PLUGGABLE else ()))
+def _writable(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Defaults that yaml can hold; an option without a default must be given."""
+    found = {name: "???" if value is inspect.Parameter.empty else value for name, value in options.items()}
+    return {k: list(v) if isinstance(v, tuple) else v for k, v in found.items() if isinstance(v, _PLAIN)}
 
 
-def check_choices(arguments: Sequence[str]) -> None:
-    """Refuse group choices that do not exist, with the known ones and the nearest.
+def _game(node: dict[str, Any]) -> dict[str, Any]:
+    """A game with all constants that are numbers."""
+    constants = {key: value for key, value in node.items() if type(value) in (int, float)}
+    return {"game": {"name": node["name"], "constants": constants}}
+
+
+def _method(node: dict[str, Any]) -> dict[str, Any]:
+    """A method whose function is a plugin: the terms are those of `operator=hno`."""
+    content = OmegaConf.to_container(OmegaConf.load(config_dir() / "operator" / "hno.yaml"))
+    assert isinstance(content, dict)
+    return {"operator": {"function": node["name"], **node}, "loss": content["loss"]}
+
+
+_PLAIN = (bool, int, float, str, tuple, list, dict, type(None))
+_NODES: Mapping[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
+    "game": _game,
+    "operator": _method,
+    "optimizer": lambda node: {"optimizer": {"lr": 3e-3, "schedule": "cosine", "final_lr": 3e-5, **node}},
+}
+"""Groups whose nodes are more than a name and options."""
+
+
+def check_choices(name: str, overrides: Sequence[str]) -> None:
+    """Refuse group choices that do not exist. Registries are imported for choices without a file only.
 
     Raises:
-        SystemExit: a choice does not exist.
+        UsageError: a choice does not exist; the message has the known ones and the nearest.
     """
-    if any(argument.startswith(("--config-dir", "-cd")) for argument in arguments):
-        return  # choices may come from the user's own folder; Hydra lists them
-    groups = {path.name for path in config_dir().iterdir() if path.is_dir()}
-    for argument in arguments:
-        match = re.fullmatch(r"\+?([a-z_]+)=([\w.,-]+)", argument)
-        if match is None or match[1] not in groups:
+    composed = groups(name)
+    for override in overrides:
+        match = re.fullmatch(r"\+*([a-z_]+)=([\w.,-]+)", override)
+        if match is None or match[1] not in composed:
             continue
-        for name in match[2].split(","):
-            if name not in (*choices(match[1]), "null", ""):
-                sys.exit(unknown_name(match[1], name, choices(match[1])))
+        group, known = match[1], choices(match[1])
+        wanted = {choice for choice in match[2].split(",") if choice != "null" and known.get(choice) is None}
+        if not wanted:
+            continue
+        register_plugins()
+        names = {*known, *(REGISTRIES[group]().names() if group in CHOSEN else ())}
+        for choice in sorted(wanted - names):
+            raise UsageError(unknown_name(group, choice, sorted(names)))
+
+
+def for_hydra(name: str, given: Arguments) -> list[str]:
+    """Overrides as Hydra takes them, after the user's folder and the plugins are known to it.
+
+    Raises:
+        UsageError: a choice that does not exist, or a folder of configurations that does not.
+    """
+    folder = given.flags.get("--config-dir")
+    if folder is not None and not Path(folder).is_dir():
+        raise UsageError(f"--config-dir: there is no folder {folder}.")
+    Folders.own = [] if folder is None else [Path(folder)]
+    Plugins.instance().register(Folders)
+    check_choices(name, given.overrides)
+    composed, untouched = groups(name), folders()
+    if "--multirun" in given.flags:
+        untouched |= _swept(name, [override for override in given.overrides if override.startswith("experiment=")])
+    return [rewritten(override, composed, untouched) for override in given.overrides]
+
+
+def _swept(name: str, experiment: Sequence[str]) -> set[str]:
+    """Keys that an experiment sweeps over: Hydra lets the command line narrow them under the same name only."""
+    compose(name, experiment)
+    return set(HydraConfig.get().sweeper.params or ())
+
+
+def compose(name: str, overrides: Sequence[str]) -> DictConfig:
+    """A configuration as Hydra composes it, without a job; interpolations that name `hydra` work."""
+    with hydra.initialize_config_dir(str(config_dir()), version_base="1.3"):
+        config = hydra.compose(name, overrides=list(overrides), return_hydra_config=True)
+    HydraConfig.instance().set_config(config)
+    OmegaConf.set_struct(config, False)
+    del config["hydra"]
+    return config
+
+
+def read(model: type[S], config: DictConfig) -> S:
+    """The composed configuration, judged by the schema of its command.
+
+    Top-level entries that an experiment's file declares for its own interpolations are no part of it.
+
+    Raises:
+        SettingsError: see `hno.cli.schema.validated`.
+    """
+    hydra_config = HydraConfig.get()
+    chosen = hydra_config.runtime.choices.get("experiment")
+    files = [folder / "experiment" / f"{chosen}.yaml" for folder in Folders.all()]
+    helpers = {key for file in files if file.exists() for key in OmegaConf.load(file)} - model.model_fields.keys()
+    given = {override.partition("=")[0].lstrip("+~") for override in hydra_config.overrides.task}
+    known = {key: value for key, value in _content(config).items() if key not in helpers and value != "???"}
+    return validated(model, known, given)
+
+
+def _content(config: DictConfig) -> dict[str, Any]:
+    content = OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
+    assert isinstance(content, dict)
+    return {str(key): value for key, value in content.items()}
+
+
+def configured(name: str, model: type[S], given: Arguments) -> S | None:
+    """The settings of a command without jobs; None after a dry run, which prints them.
+
+    What a game's file says for other commands is left out.
+
+    Raises:
+        ValueError: a configuration that cannot be composed, or one that the schema refuses.
+    """
+    overrides = for_hydra(name, given)
+    try:
+        config = compose(name, overrides)
+        chosen = [override for override in overrides if override.split("=")[0] in groups(name)]
+        for key, value in _content(compose(name, chosen)).items():
+            if key not in model.model_fields and _content(config)[key] == value:
+                del config[key]
+        settings = read(model, config)
+    except (HydraException, OmegaConfBaseException) as error:
+        raise SettingsError(explain(error)) from error
+    if "--dry-run" not in given.flags:
+        return settings
+    print(OmegaConf.to_yaml(OmegaConf.create(settings.model_dump())), end="")
+    return None
+
+
+def quoted(value: str) -> str:
+    """A value that Hydra's grammar takes for one text, whatever is in it."""
+    return "'" + re.sub(r"(\\*)'", r"\1\1\\'", value) + "'"
 
 
 def explain(error: Exception) -> str:
     """The message of a configuration error; unknown keys come with the known ones and the nearest."""
     cause = error.__cause__
     if isinstance(cause, (ConfigAttributeError, ConfigKeyError)) and isinstance(cause.parent_node, DictConfig):
-        if str(cause.full_key).startswith("game.constants."):
-            return f"Constants of a game need a plus sign: write +{cause.full_key}=<value>."
-        if str(cause.full_key).startswith("conditions."):
-            value = "<value>" if str(cause.full_key).count(".") > 1 else "{...}"
-            return f"New conditions and entries of conditions need a plus sign: write +{cause.full_key}={value}."
         known = sorted(str(key) for key in cause.parent_node)
         return f"{cause.full_key} does not exist. " + unknown_name("configuration key", str(cause.key), known)
     return str(error)
 
 
-def run_command(config_name: str, task: Callable[[DictConfig], bool]) -> None:
-    """Run a task under Hydra, in every job of a multirun, and exit with 1 if one of them failed.
-
-    A multirun ends with a table of its jobs, also when it is interrupted. The last line is the path of the page, which
-    failed runs have too.
-
-    Args:
-        config_name: the root configuration.
-        task: does one job; false if it failed (it has said why).
-    """
-    check_choices(sys.argv[1:])
-    sys.argv[1:] = [re.sub(r"^theta=([^'\"]*[,;].*)$", r"theta='\1'", argument) for argument in sys.argv[1:]]
-    register_plugins()
-    outcomes: list[bool] = []
-    jobs: list[Job] = []
-    folders: list[Path] = []
-    os.environ["HYDRA_FULL_ERROR"] = "1"  # exceptions reach this function; it says what they mean
-
-    def job(config: DictConfig) -> None:
-        current = Job.current()
-        jobs.extend([] if current is None else [current])
-        folders.append(Path(HydraConfig.get().runtime.output_dir))
-        outcomes.append(_attempt(task, config))
-
-    try:
-        hydra.main(version_base="1.3", config_path=str(config_dir()), config_name=config_name)(job)()
-    except OSError as error:
-        sys.exit(f"The output folder cannot be written ({error}). Choose another with hydra.run.dir=<folder>.")
-    except (HydraException, OmegaConfBaseException) as error:
-        sys.exit(explain(error))
-    finally:
-        if jobs:
-            show_jobs(jobs)
-    if not jobs:
-        for folder in folders:
-            if (folder / "results.json").exists():
-                print(pages.write(folder))
-    if not all(outcomes):
-        sys.exit(1)
+def comments(text: str) -> Iterator[tuple[str, str]]:
+    """Keys of a yaml file, with dots, and the comments that stand behind them."""
+    above: list[tuple[int, str]] = []
+    for line in text.splitlines():
+        match = re.match(r"( *)([\w]+):(.*)$", line)
+        if match is None:
+            continue
+        above = [entry for entry in above if entry[0] < len(match[1])] + [(len(match[1]), match[2])]
+        comment = re.search(r"(?:^|\s)#\s*(.+)$", match[3])
+        if comment is not None:
+            yield ".".join(key for _, key in above), comment[1]
 
 
-def _attempt(task: Callable[[DictConfig], bool], config: DictConfig) -> bool:
-    """Run a task; a configuration that cannot be resolved is a failure of its own, not of the jobs after it."""
-    try:
-        return task(config)
-    except OmegaConfBaseException as error:
-        hydra_config = HydraConfig.get()
-        chosen = {group: hydra_config.runtime.choices.get(group) for group in PLUGGABLE}
-        path = Path(hydra_config.runtime.output_dir) / "results.json"
-        Results(path, chosen).update(status="failed", reason=explain(error))
-        log.error("%s", explain(error))
-        return False
+def heading(path: Path) -> str:
+    """The first sentence of the comment at the head of a yaml file."""
+    lines = path.read_text(encoding="utf-8").splitlines()
+    head = [line.lstrip("# ") for line in lines if line.startswith("#") and "@package" not in line]
+    return re.split(r"(?<=\.) ", " ".join(head))[0].rstrip(".") if lines and lines[0].startswith("#") else ""

@@ -4,56 +4,93 @@ from __future__ import annotations
 
 import logging
 import time
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
-from hno.cli.build import cache_folder
-from hno.cli.checks import finite_number, flag, whole_number
-from hno.cli.config import run_command
-from hno.cli.logs import send_lightning_to_hydra
+from hno.cli import launch
+from hno.cli.arguments import Arguments
+from hno.cli.checkpoints import trained
+from hno.cli.config import read
+from hno.cli.logs import send_lightning_to_hydra, use_threads
+from hno.cli.media import draw_typical
 from hno.cli.results import Results, config_hash, plain, write_json
+from hno.cli.schema import Episodes, EvaluateSettings
 from hno.cli.sections import check_sections, evaluation_of, run_sections, table_condition
-from hno.cli.starts import TestLabels
+from hno.cli.starts import TestLabels, cache_folder
 from hno.cli.summary import report, show
-from hno.control.rollout import control_steps, rollout
+from hno.control.rollout import control_steps
 from hno.evaluation.closed_loop import CollisionTable, play
 from hno.evaluation.comparison import PairedComparison, check_same_game
 from hno.evaluation.episodes import EPISODES, episodes
 from hno.evaluation.sections import Evaluation
 from hno.games import Game
 from hno.games.grid import parse_types
-from hno.report.picture import PlotsMissingError, rollout_picture, typical
 from hno.training.checkpoint import LearnedPolicy, load_policy
 from hno.types import Extremal
 
 log = logging.getLogger(__name__)
 
-
-def main() -> None:
-    """Entry point."""
-    run_command("evaluate", evaluate)
+Types = tuple[float, ...]
+"""One type per player."""
 
 
-def evaluate(config: DictConfig) -> bool:
+def run(given: Arguments) -> int:
+    """`hno evaluate`."""
+    return launch.run("evaluate", check, evaluate, given)
+
+
+def check(config: DictConfig) -> EvaluateSettings:
+    """The settings of an evaluation that can be made; nothing is solved or written.
+
+    Raises:
+        ValueError, LookupError: entries that are unknown or make no sense, together or for the game.
+        CheckpointError: a checkpoint that cannot be read.
+    """
+    settings = read(EvaluateSettings, config)
+    with warnings.catch_warnings(action="ignore"):  # the run warns
+        policies, types = load(settings)
+        for evaluation in describe(settings, list(map(str, checkpoints_of(settings))), policies, types):
+            check_sections(evaluation)
+    return settings
+
+
+def describe(
+    settings: EvaluateSettings, names: Sequence[str], policies: Sequence[LearnedPolicy], types: Sequence[Types]
+) -> list[Evaluation]:
+    """The evaluation of every model, before its labels are solved."""
+    options = plain(settings)
+    solve = TestLabels(policies[0].game, types, options, cache_folder(settings.cache), settings.workers)
+    return [evaluation_of(name, policy, types, options, solve) for name, policy in zip(names, policies, strict=True)]
+
+
+def load(settings: EvaluateSettings) -> tuple[list[LearnedPolicy], list[tuple[float, ...]]]:
+    """The models to evaluate and the types at which to do so. Raises as `check`."""
+    paths = checkpoints_of(settings)
+    policies = [load_policy(path, settings.expected_game) for path in paths]
+    check_same_game(list(map(str, paths)), [policy.game for policy in policies])
+    check_evaluation(policies[0].game, settings)
+    chosen = [types_to_evaluate(settings.theta, policy, settings.unseen) for policy in policies]
+    return policies, list(dict.fromkeys(theta for own in chosen for theta in own))
+
+
+def evaluate(settings: EvaluateSettings) -> bool:
     """Evaluate checkpoints and write results.json into the run's own folder.
 
     Returns:
         Whether it succeeded. A failure has been logged and is in results.json.
     """
     send_lightning_to_hydra()
-    if OmegaConf.is_missing(config, "checkpoint"):
-        log.error("Say which checkpoint to evaluate: python evaluate.py checkpoint=<path to best.ckpt>")
-        return False
-    folder = Path(HydraConfig.get().runtime.output_dir)
-    head = {"checkpoint": checkpoints_of(config)[0], "config_hash": config_hash(config), "config": plain(config)}
+    folder, paths = Path(HydraConfig.get().runtime.output_dir), list(map(str, checkpoints_of(settings)))
+    head = {"checkpoint": paths[0], "config_hash": config_hash(settings), "config": plain(settings)}
     results = Results(folder / "results.json", head)
     try:
-        _run(config, results)
+        evaluate_models(settings, paths, results)
     except Exception as error:
         results.update(status="failed", reason=f"{type(error).__name__}: {error}")
         report(error)
@@ -65,29 +102,19 @@ def evaluate(config: DictConfig) -> bool:
     return True
 
 
-def checkpoints_of(config: DictConfig) -> list[str]:
-    """Paths of the models: one, or several of a list; an empty list names none."""
-    several = OmegaConf.is_list(config.checkpoint) and len(config.checkpoint) > 0
-    return [str(path) for path in config.checkpoint] if several else [str(config.checkpoint)]
+def checkpoints_of(settings: EvaluateSettings) -> list[Path]:
+    """Files of the models: one, or several of a list."""
+    given = settings.checkpoint
+    return [trained(str(path)) for path in (given if isinstance(given, list) else [given])]
 
 
-def _run(config: DictConfig, results: Results) -> None:
-    paths = checkpoints_of(config)
-    policies = [load_policy(path, config.expected_game) for path in paths]
-    game = policies[0].game
+def evaluate_models(settings: EvaluateSettings, paths: Sequence[str], results: Results) -> None:
+    """Evaluate the models of these files; every part is written into the results as it is done."""
+    use_threads(settings.threads)
+    policies, types = load(settings)
     results.update(**policies[0].names(), seed=policies[0].provenance.seed)
-    check_same_game(paths, [policy.game for policy in policies])
-    check_evaluation(game, config)
-    chosen = [types_to_evaluate(config.theta, policy, config.unseen) for policy in policies]
-    types = list(dict.fromkeys(theta for own in chosen for theta in own))
-    settings = plain(config)
-    solve = TestLabels(game, types, settings, cache_folder(config.cache), config.workers)
-    evaluations = [
-        evaluation_of(path, policy, types, settings, solve) for path, policy in zip(paths, policies, strict=True)
-    ]
-    for evaluation in evaluations:
-        check_sections(evaluation)
-    labels = solve_tests(solve, evaluations[0], results)
+    evaluations = describe(settings, paths, policies, types)
+    labels = solve_tests(evaluations[0], results)
     models, played = list[dict[str, Any]](), list[Evaluation]()
     for policy, evaluation in zip(policies, evaluations, strict=True):
         log.info("evaluation of %s", evaluation.name)
@@ -103,28 +130,48 @@ def _run(config: DictConfig, results: Results) -> None:
     results.update(status="finished")
 
 
-def types_to_evaluate(
-    text: str, policy: LearnedPolicy, unseen: Sequence[Sequence[float]] = ()
-) -> list[tuple[float, ...]]:
-    """Player types from "default", a named grid, or a list such as "1,1;2.5,4".
+def types_to_evaluate(choice: Any, policy: LearnedPolicy, unseen: Any = None) -> list[tuple[float, ...]]:
+    """Player types to evaluate a policy at.
 
-    Default are the labelled types, and those of `unseen` that lie in the game's type box.
+    Default are the labelled types and those that `unseen` adds.
+
+    Args:
+        choice: "default", or what `parse_types` takes.
+        policy: the policy.
+        unseen: see `unseen_types`.
 
     Raises:
         ValueError: none of these, or entries that are not one finite number per player.
     """
-    game = policy.game
-    if text == "default":
-        own = [theta for theta in unseen if len(theta) == game.players]
-        inside = [theta for theta in own if bool(game.type_box.contains(torch.tensor(theta)))]
-        return list(dict.fromkeys([*policy.types, *game.validate_types(inside)]))
-    return parse_types(game, text, key="theta", also=("default",))
+    if choice != "default":
+        return parse_types(policy.game, choice, key="theta", also=("default",))
+    return list(dict.fromkeys([*policy.types, *unseen_types(policy.game, unseen, "unseen")]))
 
 
-def solve_tests(solve: TestLabels, evaluation: Evaluation, results: Results) -> list[Extremal]:
+def unseen_types(game: Game, choice: Any, key: str) -> list[tuple[float, ...]]:
+    """Types that are evaluated beside the labelled ones: the chosen ones, or four at quarters of the type box.
+
+    Args:
+        game: the game.
+        choice: what `parse_types` takes; None for the four.
+        key: where the choice stands, for messages.
+    """
+    if choice is not None:
+        return parse_types(game, choice, key=key) if choice else []
+    lo, width = game.type_box.lo, game.type_box.hi - game.type_box.lo
+    quarters = [[own, *[others] * (game.players - 1)] for own, others in QUARTERS]
+    return game.validate_types([(lo + width * torch.tensor(row) / 4).tolist() for row in quarters])
+
+
+QUARTERS = ((0, 1), (1, 1), (1, 3), (3, 4))
+"""Places in the type box, of the first player and of the others, in quarters of its edges."""
+
+
+def solve_tests(evaluation: Evaluation, results: Results) -> list[Extremal]:
     """Labels of the test starts of every type, from the cache or solved."""
-    labels = solve(evaluation.condition)
-    results.time("test_labels", solve.seconds)
+    began = time.perf_counter()
+    labels = list(evaluation.solve(evaluation.condition))
+    results.time("test_labels", time.perf_counter() - began)
     results.update(test_seed=evaluation.condition.disturbance.seed)
     return labels
 
@@ -137,11 +184,12 @@ def evaluate_policy(evaluation: Evaluation, labels: Sequence[Extremal], results:
     """Play from the starts of the labels, put the table into the results, keep some episodes and draw one."""
     found, table = assess(evaluation, labels, results)
     folder, game = results.path.parent, found.game
-    write_json(folder / EPISODES, episodes(game, found.played, labels, found.clearance))
+    kept = episodes(game, found.played, labels, found.clearance)
+    write_json(folder / EPISODES, kept)
     conditions = {name: found.options[name] for name in ("clearance", "dt", "widen", "noise", "delay")}
     results.update(**conditions, constraint_unit=game.constraint_unit, table=table, episodes=EPISODES)
     title = " / ".join(str(results.content[name]) for name in ("game", "operator", "activation"))
-    draw(found, folder / "rollout.png", title)
+    draw_typical(kept["episodes"], folder / "rollout.png", title)
     return found, table
 
 
@@ -156,25 +204,7 @@ def assess(evaluation: Evaluation, labels: Sequence[Extremal], results: Results)
     return found, table
 
 
-def draw(evaluation: Evaluation, path: Path, title: str, episodes: int = 15) -> None:
-    """Draw a typical episode from the first starts of the first type; without matplotlib, say so."""
-    labels, game = evaluation.labels[0], evaluation.game
-    starts, theta = labels.x[:episodes, 0].float(), labels.theta[:episodes].float()
-    played = rollout(game, evaluation.policy, starts, theta, evaluation.dt)
-    try:
-        rollout_picture(game, played, theta, path, title, typical(played))
-    except PlotsMissingError as error:
-        log.info("No picture: %s", error)
-
-
-def check_evaluation(game: Game, settings: DictConfig) -> None:
+def check_evaluation(game: Game, settings: Episodes) -> None:
     """Raise ValueError for entries that make no evaluation of the game."""
-    for name, least in (("starts", 1), ("seed", 0)):
-        whole_number(name, settings[name], least)
-    if settings.get("workers") is not None:
-        whole_number("workers", settings.workers, 1)
-    for name in ("clearance", "dt"):
-        finite_number(name, settings[name])
     table_condition(game, plain(settings))
-    flag("safe", settings.safe)
     control_steps(game, settings.dt)

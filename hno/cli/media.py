@@ -1,11 +1,12 @@
-"""What dashboards get at the end of a run: numbers by type, a map over types, episodes as picture and animation."""
+"""What dashboards get at the end of a run: numbers by type, a map over types, pictures of episodes."""
 
 from __future__ import annotations
 
 import json
 import logging
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +14,6 @@ from lightning.pytorch.loggers import Logger, TensorBoardLogger, WandbLogger
 
 from hno.evaluation.format import number
 from hno.evaluation.outcome import pooled
-from hno.report.collision_map import collision_map
-from hno.report.gif import animate
-from hno.report.picture import PlotsMissingError
 
 log = logging.getLogger(__name__)
 
@@ -24,7 +22,7 @@ def publish(loggers: Sequence[Logger], results: Mapping[str, Any], folder: Path,
     """Send what came of a run to its loggers. One that refuses, or a failed picture, costs a warning, not the run.
 
     Args:
-        loggers: all of them get the numbers; W&B pictures, an animation and the table too; TensorBoard pictures.
+        loggers: all of them get the numbers; W&B pictures and the table too; TensorBoard pictures.
         results: content of results.json.
         folder: the run's; pictures are written there.
         step: the last one of the training.
@@ -72,20 +70,45 @@ def draw(results: Mapping[str, Any], folder: Path, kinds: Collection[type[Logger
     """
     title = " / ".join(str(results.get(name, "n/a")) for name in ("game", "operator", "activation"))
     made = {"rollout": folder / "rollout.png"}
-    try:
+    with _harmless():
+        from hno.report import pictures
+        from hno.report.episode import episode
+
         worst = worst_episode(results, folder) if WandbLogger in kinds else None
         if worst is not None:
-            made["worst_episode"] = folder / "worst_episode.gif"
-            heading = f"{title}\nsmallest clearance, {number(worst['clearance'])} m at ({name_of(worst['theta'])})"
-            animate(worst, made["worst_episode"], heading)
+            made["worst_episode"] = folder / "worst_episode.png"
+            smallest = f"{number(worst['clearance'])} {results.get('constraint_unit', 'm')}".strip()
+            heading = f"{title}\nsmallest clearance, {smallest} at ({name_of(worst['theta'])})"
+            pictures.rollout_picture(episode(worst), made["worst_episode"], heading)
         if not {WandbLogger, TensorBoardLogger}.isdisjoint(kinds):
             made["collision_map"] = folder / "collision_map.png"
-            collision_map(results["table"], made["collision_map"], title)
-    except (PlotsMissingError, OSError, ValueError) as error:
-        log.info("No picture for dashboards: %s", error)
-    except Exception as error:
-        log.warning("A picture for dashboards could not be drawn: %s: %s", type(error).__name__, error)
+            pictures.collision_map(results["table"], made["collision_map"], title)
     return {name: path for name, path in made.items() if path.exists()}
+
+
+def draw_typical(episodes: Sequence[Mapping[str, Any]], path: Path, title: str) -> None:
+    """Draw the first typical episode of episodes.json, if there is one; say what cannot be drawn."""
+    typical = next((entry for entry in episodes if entry["kind"] == "typical"), None)
+    with _harmless():
+        from hno.report.episode import episode
+        from hno.report.pictures import rollout_picture
+
+        if typical is None:
+            raise ValueError("no start has a safe equilibrium")
+        rollout_picture(episode(typical), path, title)
+
+
+@contextmanager
+def _harmless() -> Iterator[None]:
+    """A picture that cannot be drawn costs a line in the log, not the run."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        log.info("No picture: it needs the package %s.", error.name)
+    except (OSError, ValueError) as error:
+        log.info("No picture: %s", error)
+    except Exception as error:
+        log.warning("A picture could not be drawn: %s: %s", type(error).__name__, error)
 
 
 def worst_episode(results: Mapping[str, Any], folder: Path) -> dict[str, Any] | None:
@@ -106,8 +129,7 @@ def _send_to_wandb(logger: WandbLogger, results: Mapping[str, Any], pictures: Ma
     nobody = "n/a" if whole.rate is None else "none"
     logger.experiment.summary["test/worst_theta"] = name_of(whole.worst_theta) if whole.worst_theta else nobody
     for name, path in pictures.items():
-        send = logger.log_video if path.suffix == ".gif" else logger.log_image
-        send(name, [str(path)], step)
+        logger.log_image(name, [str(path)], step)
     columns = list(results["table"][0]) if results["table"] else []
     logger.log_table("types", columns, [[str(row[name]) for name in columns] for row in results["table"]], step=step)
 
@@ -118,7 +140,7 @@ def _send_to_tensorboard(
     head = {name: str(results.get(name)) for name in ("game", "operator", "activation", "seed", "config_hash")}
     logger.log_hyperparams(head, numbers(results), step)
     for name, path in pictures.items():
-        if path.suffix == ".png":
-            from matplotlib.image import imread
+        from numpy import asarray
+        from PIL.Image import open as read
 
-            logger.experiment.add_image(name, imread(path), step, dataformats="HWC")
+        logger.experiment.add_image(name, asarray(read(path)), step, dataformats="HWC")

@@ -12,26 +12,27 @@ from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
+from pydantic import BaseModel
 
 import hno
 from hno.data.store import replace_whole
 
-SCHEMA = 2
-"""Version of results.json."""
 PACKAGES = ("torch", "lightning", "torchmetrics", "hydra-core", "omegaconf", "wandb", "scipy", "safetensors")
 
 
-def plain(config: DictConfig) -> dict[str, Any]:
-    """A configuration node as plain containers."""
-    content = OmegaConf.to_container(config, resolve=True)
+def plain(config: DictConfig | BaseModel) -> dict[str, Any]:
+    """A configuration as plain containers."""
+    content = config.model_dump() if isinstance(config, BaseModel) else OmegaConf.to_container(config, resolve=True)
     assert isinstance(content, dict)
     return {str(key): value for key, value in content.items()}
 
 
-def config_hash(config: DictConfig) -> str:
+def config_hash(config: DictConfig | BaseModel) -> str:
     """Hash of what determines a run's numbers; folders, logging and the number of workers do not."""
     content = plain(config)
     for key in ("logger", "resume", "checkpoint"):
+        content.pop(key, None)
+    for key in ("cache", "workers", "threads"):
         content.pop(key, None)
     for group, key in (("data", "cache"), ("data", "workers"), ("trainer", "print_every"), ("trainer", "threads")):
         content.get(group, {}).pop(key, None)
@@ -70,7 +71,7 @@ class Results:
     def __init__(self, path: Path, head: Mapping[str, Any]) -> None:
         self.path = path
         self.content: dict[str, Any] = {
-            "schema": SCHEMA, "status": "running", "reason": None, **head, "seconds": {}, "table": [],
+            "status": "running", "reason": None, **head, "seconds": {}, "table": [],
             "episodes": None, "versions": versions(),
         }  # fmt: skip
         self.write()

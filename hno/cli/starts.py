@@ -8,10 +8,15 @@ from pathlib import Path
 from typing import Any
 
 from hno.cli.logs import label_progress
-from hno.data.labels import Request, labels_for, safe_labels_for
+from hno.data.labels import Request, default_cache, labels_for, safe_labels_for
 from hno.evaluation.conditions import Condition
 from hno.games import Game
 from hno.types import Extremal
+
+
+def cache_folder(choice: str | None) -> Path:
+    """The folder of label files."""
+    return Path(choice) if choice is not None else default_cache()
 
 
 class TestLabels:

@@ -44,7 +44,11 @@ class Job(NamedTuple):
         hydra = HydraConfig.get()
         if hydra.mode is None or hydra.mode.name != "MULTIRUN":
             return None
-        return cls(hydra.job.num, Path(hydra.runtime.output_dir), tuple(hydra.overrides.task))
+        return cls(
+            hydra.job.num,
+            Path(hydra.runtime.output_dir),
+            tuple(setting.lstrip("+") for setting in hydra.overrides.task),
+        )
 
     def results(self) -> dict[str, Any]:
         """Content of its results.json; without one that can be read, a failure that says so."""
@@ -54,12 +58,17 @@ class Job(NamedTuple):
             return {"status": "failed", "reason": f"no results ({error})"}
 
 
+def counted(jobs: int) -> str:
+    """A number of jobs."""
+    return f"{jobs} job" if jobs == 1 else f"{jobs} jobs"
+
+
 def show_jobs(jobs: Sequence[Job]) -> None:
     """Print a table over all jobs, why jobs failed, and where their page lies."""
     chosen = _differences(jobs)
     rows = [(job, found, chosen[job.number]) for job, found in sorted(((j, j.results()) for j in jobs), key=_order)]
     extra = ("settings",) if any(chosen.values()) else ()
-    table = Table(title=f"{len(jobs)} jobs", caption=CAPTION, box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    table = Table(title=counted(len(jobs)), caption=CAPTION, box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
     for name in ("job", *NAMES, *extra, *COLUMNS):
         table.add_column(name, no_wrap=name not in WRAPPED)
     for job, found, settings in rows:

@@ -9,51 +9,56 @@ from pathlib import Path
 from typing import Any
 
 import lightning as L
-import torch
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig
 
+from hno.cli import launch
+from hno.cli.arguments import Arguments
 from hno.cli.build import (
     build_architecture,
     build_data,
     build_game,
     build_objective,
     build_settings,
-    cache_folder,
-    check_numbers,
+    check,
+    streams,
 )  # fmt: skip
-from hno.cli.checks import whole_number
-from hno.cli.config import run_command
-from hno.cli.evaluate import check_evaluation, evaluate_policy, solve_tests
-from hno.cli.logs import StepLines, finish_wandb, label_progress, loggers, progress_bar, send_lightning_to_hydra
+from hno.cli.checkpoints import resumed
+from hno.cli.evaluate import evaluate_policy, solve_tests, unseen_types
+from hno.cli.logs import (
+    StepLines,
+    finish_wandb,
+    label_progress,
+    loggers,
+    progress_bar,
+    send_lightning_to_hydra,
+    use_threads,
+)
 from hno.cli.media import publish
 from hno.cli.results import Results, config_hash, plain
+from hno.cli.schema import TrainSettings
 from hno.cli.sections import evaluation_of, run_sections
-from hno.cli.starts import TestLabels
+from hno.cli.starts import TestLabels, cache_folder
 from hno.cli.summary import report, show
-from hno.data import GameData
-from hno.data.certificates import safe, summary
+from hno.data.certificates import summary
+from hno.data.datamodule import GameData, safe_sets
 from hno.data.labels import Request, safe_labels_for
-from hno.evaluation.kernels import check_rows
-from hno.games import Game
 from hno.games.grid import parse_types
 from hno.operators import make_operator
 from hno.training.checkpoint import Provenance, check_resumable, load_policy, record
 from hno.training.divergence import DivergedError
 from hno.training.fit import Fitted, fit
-from hno.training.optimizers import make_optimizer
-from hno.training.validation import BEST
+from hno.training.validation import BEST, PROBE, Later
 from hno.types import Extremal, part
 
 log = logging.getLogger(__name__)
 
 
-def main() -> None:
-    """Entry point."""
-    run_command("train", train)
+def run(given: Arguments) -> int:
+    """`hno train`."""
+    return launch.run("train", check, train, given)
 
 
-def train(config: DictConfig) -> bool:
+def train(settings: TrainSettings) -> bool:
     """One run; its folder gets best.ckpt, last.ckpt, metrics and results.json.
 
     Returns:
@@ -62,17 +67,17 @@ def train(config: DictConfig) -> bool:
     send_lightning_to_hydra()
     folder = Path(HydraConfig.get().runtime.output_dir)
     head = {
-        "game": config.game.name,
-        "operator": config.operator.name,
-        "activation": config.activation.name,
-        "seed": config.seed,
-        "steps": config.trainer.max_steps,
-        "config_hash": config_hash(config),
-        "config": plain(config),
+        "game": settings.game.name,
+        "operator": settings.operator["name"],
+        "activation": settings.activation["name"],
+        "seed": settings.seed,
+        "steps": settings.trainer.max_steps,
+        "config_hash": config_hash(settings),
+        "config": plain(settings),
     }
     results = Results(folder / "results.json", head)
     try:
-        _run(config, folder, results)
+        _run(settings, folder, results)
     except Exception as error:
         results.update(status="failed", reason=f"{type(error).__name__}: {error}")
         report(error)
@@ -89,43 +94,30 @@ def train(config: DictConfig) -> bool:
     return True
 
 
-def _run(config: DictConfig, folder: Path, results: Results) -> None:
-    check_numbers(config)
-    settings = config.evaluation
-    game = build_game(config)
-    check_evaluation(game, settings)
-    unseen = game.validate_types(settings.types)
-    if settings.ntk:
-        check_rows(make_operator(game, build_architecture(config)), settings.ntk_rows)
-    fitted = train_operator(config, folder, results)
-    policy = load_policy(fitted.checkpoint)
+def _run(settings: TrainSettings, folder: Path, results: Results) -> None:
+    fitted = train_operator(settings, folder, results)
+    chosen, policy = plain(settings.evaluation), load_policy(fitted.checkpoint)
+    unseen = unseen_types(policy.game, settings.evaluation.types, "evaluation.types")
     types = list(dict.fromkeys([*policy.types, *unseen]))
-    chosen = plain(settings)
-    solve = TestLabels(game, types, chosen, cache_folder(config.data.cache), config.data.workers)
+    solve = TestLabels(policy.game, types, chosen, cache_folder(settings.data.cache), settings.data.workers)
     evaluation = evaluation_of(results.content["checkpoint"], policy, types, chosen, solve)
-    assessed, _ = evaluate_policy(evaluation, solve_tests(solve, evaluation, results), results)
+    assessed, _ = evaluate_policy(evaluation, solve_tests(evaluation, results), results)
     for name, content in run_sections(assessed, results):
         results.update(**{name: content})
     results.update(status="finished")
     publish(fitted.trainer.loggers, results.content, folder, fitted.trainer.global_step)
 
 
-def train_operator(config: DictConfig, folder: Path, results: Results) -> Fitted:
+def train_operator(settings: TrainSettings, folder: Path, results: Results) -> Fitted:
     """Solve labels and train; the folder gets `last.ckpt` and `best.ckpt`, the results how it went and which to use."""
-    check_numbers(config)
-    L.seed_everything(config.seed, verbose=False)
-    if config.trainer.threads is not None:
-        torch.set_num_threads(config.trainer.threads)
-    game, architecture, objective = build_game(config), build_architecture(config), build_objective(config)
+    L.seed_everything(settings.seed, verbose=False)
+    use_threads(settings.trainer.threads)
+    game, architecture, objective = build_game(settings.game), build_architecture(settings), build_objective(settings)
     operator = make_operator(game, architecture)
-    terms = objective.used(exact_terminal=operator.meets_terminal)
-    data = build_data(config, game, frozenset(term.stream for term in terms.values()), label_progress())
-    origin = Provenance(config.operator.name, data.type_list, config.seed, config_hash(config))
-    entries, settings = record(game, architecture, origin), build_settings(config)
-    check_validation(data.game, config.validation)
-    make_optimizer(steps=settings.steps, **settings.optimizer)
-    makers = loggers(config, folder)
-    resume = None if config.resume is None else Path(config.resume)
+    data = build_data(settings, game, streams(objective, operator), label_progress())
+    origin = Provenance(settings.operator["name"], data.type_list, settings.seed, config_hash(settings))
+    entries, makers = record(game, architecture, origin), loggers(settings, folder)
+    resume = None if settings.resume is None else resumed(settings.resume)
     if resume is not None:
         check_resumable(resume, entries)
     _take_over(None if resume is None else resume.parent / BEST, folder / BEST)
@@ -133,10 +125,10 @@ def train_operator(config: DictConfig, folder: Path, results: Results) -> Fitted
     data.setup("fit")
     results.time("labels", data.label_seconds)
     results.update(label_statistics=label_statistics(data.extremals))
-    validation = validation_labels(config, data, results)
+    first, later = validation_starts(settings, data, results)
     fitted = fit(
-        operator, objective, data, settings, folder,
-        validation=validation, record=entries, loggers=makers, callbacks=[progress(config)], resume=resume,
+        operator, objective, data, build_settings(settings), folder, validation=first, later=later, record=entries,
+        loggers=makers, callbacks=[progress_bar() or StepLines(settings.trainer.print_every)], resume=resume,
     )  # fmt: skip
     for name, seconds in fitted.seconds.items():
         results.time(name, seconds)
@@ -149,11 +141,6 @@ def train_operator(config: DictConfig, folder: Path, results: Results) -> Fitted
     return fitted
 
 
-def progress(config: DictConfig) -> L.Callback:
-    """A live bar on a terminal, lines elsewhere."""
-    return progress_bar() or StepLines(config.trainer.print_every)
-
-
 def label_statistics(labels: Sequence[Extremal]) -> list[dict[str, Any]]:
     """What the certificates of the training labels say, type by type."""
     return [
@@ -163,24 +150,27 @@ def label_statistics(labels: Sequence[Extremal]) -> list[dict[str, Any]]:
     ]
 
 
-def validation_labels(config: DictConfig, data: GameData, results: Results) -> list[Extremal]:
-    """Labels of the safe starts that closed-loop validation plays, one set per type that has any."""
-    choice, clearance = config.validation, config.evaluation.clearance
-    found = data.held_out()
-    if choice.types is not None:
-        types = parse_types(data.game, choice.types, key="validation.types")
-        requests = [Request(theta, choice.starts, choice.seed, "validation") for theta in types]
-        found, seconds = safe_labels_for(
-            data.game,
-            requests,
-            cache_folder(config.data.cache),
-            config.data.workers,
-            label_progress(),
-            clearance=clearance,
-        )
+def validation_starts(settings: TrainSettings, data: GameData, results: Results) -> tuple[list[Extremal], Later | None]:
+    """Safe starts that closed-loop validation plays: held-out ones, or those of the chosen types.
+
+    Of the latter only those that are played first are solved before the training, the others when they are needed.
+    """
+    choice, clearance = settings.validation, settings.evaluation.clearance
+    if choice.types is None:
+        return data.safe_held_out(clearance), None
+    types = parse_types(data.game, choice.types, key="validation.types")
+    cache, workers = cache_folder(settings.data.cache), settings.data.workers
+
+    def solve(starts: int) -> list[Extremal]:
+        requests = [Request(theta, starts, choice.seed, "validation") for theta in types]
+        log.info("labels of %d safe validation starts at each of %d types", starts, len(types))
+        found, seconds = safe_labels_for(data.game, requests, cache, workers, label_progress(), clearance=clearance)
         results.time("validation_labels", seconds)
-    selected = [part(labels, safe(labels, clearance)) for labels in found]
-    return [labels for labels in selected if len(labels.status)]
+        return safe_sets(found, clearance)
+
+    first = solve(min(choice.starts, PROBE))
+    later = Later(choice.starts * len(types), lambda: solve(choice.starts))
+    return first, None if choice.starts <= PROBE else later
 
 
 def _take_over(best: Path | None, to: Path) -> None:
@@ -189,10 +179,3 @@ def _take_over(best: Path | None, to: Path) -> None:
         to.unlink(missing_ok=True)
     elif best.resolve() != to.resolve():
         shutil.copy2(best, to)
-
-
-def check_validation(game: Game, choice: DictConfig) -> None:
-    """Raise ValueError for entries that make no validation of the game."""
-    if choice.types is not None:
-        parse_types(game, choice.types, key="validation.types")
-        whole_number("validation.starts", choice.starts, 1)

@@ -180,8 +180,7 @@ class GameData(L.LightningDataModule):
 
     def safe_held_out(self, clearance: float = CLEARANCE) -> list[Extremal]:
         """Held-out labels of starts whose equilibrium keeps a clearance, one set per type that has any."""
-        selected = [part(found, safe(found, clearance)) for found in self.held_out()]
-        return [found for found in selected if len(found.status)]
+        return safe_sets(self.held_out(), clearance)
 
     def scales(self) -> tuple[Tensor, Tensor]:
         """Typical sizes of values, scalar, and of costates, (P, P, n).
@@ -272,6 +271,12 @@ class GameData(L.LightningDataModule):
     def val_dataloader(self) -> DataLoader[Sample] | list[Any]:
         """Held-out labelled rows, in one batch; nothing without labels."""
         return [] if self.val_rows is None else DataLoader(_Whole(self.val_rows), batch_size=None)
+
+
+def safe_sets(labels: Sequence[Extremal], clearance: float = CLEARANCE) -> list[Extremal]:
+    """Labels of starts whose equilibrium keeps a clearance, without sets that have none."""
+    selected = [part(found, safe(found, clearance)) for found in labels]
+    return [found for found in selected if len(found.status)]
 
 
 class _Whole(Dataset[Sample]):

@@ -67,9 +67,15 @@ class DeepONet(Network):
         activation: makes the activation of each net.
         width: hidden and output width.
         depth: hidden layers.
+
+    Raises:
+        ValueError: `width` or `depth` is below 1.
     """
 
     def __init__(self, inputs: Inputs, activation: Callable[[], Activation], width: int = 64, depth: int = 4) -> None:
+        for name, size in (("width", width), ("depth", depth)):
+            if size < 1:
+                raise ValueError(f"network.{name} must be a whole number of at least 1; got {size!r}.")
         super().__init__()
         self.inputs = inputs
         hidden, several = (width,) * (depth + 1), inputs.others > 1

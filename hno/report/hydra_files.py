@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError  # type: ignore[import-untyped]  # yaml has no annotations
 
-from hno.report.parsing import UnreadableError
+from hno.report.records import UnreadableError
 
 
 def read_yaml(path: Path) -> Any:

@@ -1,32 +1,41 @@
-"""One self-contained HTML file about a sweep: no network, no other file, at most 3 MB."""
+"""One self-contained HTML file about a sweep: no network, no other file."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jinja2
 from markupsafe import Markup
 
 from hno.data.store import replace_whole
-from hno.report import payload, words
-from hno.report.aggregate import Recipe, best, headline, total, worst
-from hno.report.charts import library, specifications
-from hno.report.further import fitting, further
-from hno.report.grouping import recipes
-from hno.report.palette import DARK, FONT, LIGHT, Palette, chart_config, signals
-from hno.report.runs import NOT_AVAILABLE, Run, Sweep
-from hno.report.tables import CACHED, generic, label_tables, names_of, recipe_table, run_table
+from hno.evaluation.format import interval, percent
+from hno.evaluation.outcome import Pooled
+from hno.evaluation.sections import plain
+from hno.report import episodes, page_data, vega, verdicts
+from hno.report.charts import specifications
+from hno.report.palette import DARK, LIGHT, chart_config, signals, variables
+from hno.report.recipes import Recipe, TypeCounts, by_type, headline, pool, recipes
+from hno.report.records import Run
+from hno.report.runs import Sweep
+from hno.report.tables import (
+    CACHED,
+    Table,
+    label_tables,
+    mapping_table,
+    names_of,
+    recipe_table,
+    run_table,
+    section_tables,
+    type_table,
+)
 
-LIMIT = 3_000_000
-"""Most bytes of a page."""
-SECTION_BYTES = 800_000
-"""Most bytes of further evaluations."""
 ASSETS = files("hno.report") / "assets"
-SCRIPTS = ("base.js", "filters.js", "tables.js", "charts.js", "player.js", "refresh.js")
+SCRIPTS = ("base.js", "filters.js", "charts.js", "player.js", "refresh.js")
 
 
 def write_page(sweep: Sweep, path: Path, refresh: float | None = None) -> None:
@@ -42,25 +51,43 @@ def write_page(sweep: Sweep, path: Path, refresh: float | None = None) -> None:
 
 
 def render(sweep: Sweep, refresh: float | None = None) -> str:
-    """The page as text; further evaluations take what room the rest leaves, then episodes."""
-    content, data = _content(sweep, refresh)
-    told = further(sweep.runs)
-    content |= {"sections": [], "sections_total": len(told)}
-    content["sections"] = fitting(told, min(SECTION_BYTES, _room(content, data)))
-    return _fill(content, data, payload.episodes(sweep.runs, max(0, _room(content, data))))
-
-
-def _room(content: Mapping[str, Any], data: Mapping[str, Any]) -> int:
-    """Bytes that a page without episodes leaves, with some to spare."""
-    return LIMIT - len(_fill(content, data, payload.Budgeted([], 0, 0)).encode()) - 20_000
-
-
-def _fill(content: Mapping[str, Any], data: Mapping[str, Any], played: payload.Budgeted) -> str:
+    """The page as text."""
+    found = recipes(sweep.runs)
+    cards = _cards(sweep.runs, found)
+    played = episodes.ranked(sweep.runs)
+    curves = page_data.learning_curves(found, sweep.runs)
+    themes = {"light": LIGHT, "dark": DARK}
+    data = {
+        "maps": {card.id: page_data.cells(card.types) for card in cards},
+        "comparison": page_data.comparison(found),
+        "curves": curves,
+        "episodes": [episodes.playable(run, one) for run, one in played[: episodes.MOST]],
+        "charts": specifications(),
+        "themes": {name: {"config": chart_config(p), "signals": signals(p)} for name, p in themes.items()},
+        "refresh": refresh,
+    }
+    unfinished = [run for run in sweep.runs if not run.finished]
+    sections = [(run.name, names_of(run, "any"), section_tables(run)) for run in sweep.runs]
+    content = {
+        "sweep": sweep, "recipes": found, "games": _games(found), "cards": cards, "unfinished": unfinished,
+        "remarks": sum(len(run.notes) for run in sweep.runs) + sum(len(recipe.repeated) for recipe in found),
+        "filters": {name: _choices(sweep.runs, name) for name in ("game", "operator", "activation", "seed")},
+        "compared_games": sorted({recipe.game for recipe in found if recipe.pooled.safe_starts}),
+        "curve_games": sorted({entry["game"] for entry in curves}),
+        "recipe_table": recipe_table(found), "run_table": run_table(sweep.runs), "labels": label_tables(sweep.runs),
+        "sections": [entry for entry in sections if entry[2]], "common": _common(sweep.runs),
+        "differing": _differing(sweep.runs, found), "versions": _versions(sweep.runs), "cached": CACHED,
+        "episodes_shown": min(len(played), episodes.MOST), "episodes_total": len(played), "refresh": refresh,
+        "variables": {name: Markup(variables(palette)) for name, palette in themes.items()},
+        "style": Markup(_asset("page.css")), "vega": Markup(_script(vega.library())),
+        "script": Markup(_script("\n".join(_asset(name) for name in SCRIPTS))), "data": embedded(data),
+        "jobs": verdicts.jobs, "why": verdicts.why, "seeds": verdicts.seeds, "at": verdicts.at,
+        "share": verdicts.share, "quality": verdicts.quality, "interval": interval, "percent": percent,
+    }  # fmt: skip
     environment = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    template = environment.from_string((ASSETS / "page.html.j2").read_text(encoding="utf-8"))
-    return template.render(**content, played=played, data=embedded({**data, "episodes": played.content}))
+    return environment.from_string(_asset("page.html.j2")).render(**content)
 
 
 def embedded(content: Any) -> Markup:
@@ -69,71 +96,6 @@ def embedded(content: Any) -> Markup:
     for character in "<>&\u2028\u2029":
         text = text.replace(character, f"\\u{ord(character):04x}")
     return Markup(text)
-
-
-def _content(sweep: Sweep, refresh: float | None) -> tuple[dict[str, Any], dict[str, Any]]:
-    """What the template shows, and what the script works with, but for episodes."""
-    found = recipes(sweep.runs)
-    cards = _cards(sweep.runs, found)
-    tables = [(card["id"], card.pop("table")) for card in cards]
-    maps = payload.maps(tables)
-    curves = payload.learning_curves(sweep.runs, {run.name: recipe.name for recipe in found for run in recipe.runs})
-    data = {
-        "maps": maps,
-        "intervals": payload.intervals(rows for name, rows in tables if name in maps),
-        "comparison": payload.comparison(found),
-        "curves": curves.content,
-        "charts": specifications(),
-        "themes": {
-            name: {"config": chart_config(p), "signals": signals(p)} for name, p in (("light", LIGHT), ("dark", DARK))
-        },
-        "refresh": refresh,
-    }
-    content = {
-        **_results(sweep, found),
-        **_origin(sweep, found),
-        "cards": [card for card in cards if card["id"] in maps],
-        "cards_total": len(cards),
-        "curves": curves,
-        "curve_games": sorted({entry["game"] for entry in curves.content}),
-        "refresh": refresh,
-        "variables": {"light": _variables(LIGHT), "dark": _variables(DARK)},
-        "style": Markup(_asset("page.css")),
-        "vega": Markup(_script(library())),
-        "script": Markup(_script("\n".join(_asset(name) for name in SCRIPTS))),
-    }
-    return content, data
-
-
-def _results(sweep: Sweep, found: Sequence[Recipe]) -> dict[str, Any]:
-    """What came of the runs, and which of them say nothing."""
-    return {
-        "name": sweep.name,
-        "jobs": words.jobs(sweep),
-        "games": _games(found),
-        "filters": {name: _choices(sweep.runs, name) for name in ("game", "operator", "activation", "seed")},
-        "cached": CACHED,
-        "recipe_table": recipe_table(found),
-        "run_table": run_table(sweep.runs),
-        "problems": [(run.name, run.status, words.why(run)[:600]) for run in sweep.runs if not run.finished],
-        "skipped": sweep.skipped,
-        "notes": [(run.name, note) for run in sweep.runs for note in run.notes],
-        "repeated": [run.name for recipe in found for run in recipe.repeated],
-        "compared_games": sorted({recipe.game for recipe in found if recipe.rate.starts}),
-        "labels": label_tables(sweep.runs),
-    }
-
-
-def _origin(sweep: Sweep, found: Sequence[Recipe]) -> dict[str, Any]:
-    """Settings, versions and command lines."""
-    common, differing = _settings(sweep.runs, found)
-    return {
-        "common": common,
-        "differing": differing,
-        "versions": _versions(sweep.runs),
-        "command": sweep.command,
-        "commands": [(run.name, run.command or f"{NOT_AVAILABLE}: no .hydra/overrides.yaml") for run in sweep.runs],
-    }
 
 
 def _asset(name: str) -> str:
@@ -146,110 +108,91 @@ def _script(text: str) -> str:
     return f"(() => {{\n{closed}\n}})();"
 
 
-def _variables(palette: Palette) -> Markup:
-    names = {name: value for name, value in palette._asdict().items() if isinstance(value, str)}
-    players = {f"player-{k + 1}": color for k, color in enumerate(palette.category[:4])}
-    scale = _gradient(palette)
-    pairs = {**names, **players, "rates": scale, "font": FONT}
-    return Markup("".join(f"--{name}:{value};" for name, value in pairs.items()))
+class Game(NamedTuple):
+    """One card of the summary."""
+
+    name: str
+    best: Recipe | None
+    """None where nothing was played."""
+    sentences: list[str]
+    """About the best recipe of every kind of conditions."""
 
 
-INFERNO = (
-    "#000004", "#160b39", "#420a68", "#6a176e", "#932667", "#bc3754", "#dd513a", "#f37819", "#fca50a", "#f6d746",
-    "#fcffa4",
-)  # fmt: skip
-"""The scale of heat maps in steps of a tenth, for the legend."""
-
-
-def _gradient(palette: Palette) -> str:
-    start, end = (round(10 * part) for part in palette.rates)
-    stops = INFERNO[start : end + 1] if start < end else INFERNO[end : start + 1][::-1]
-    return f"linear-gradient(to right,{','.join(stops)})"
-
-
-def _games(found: Sequence[Recipe]) -> list[dict[str, Any]]:
-    """One card of the summary for every game."""
-    chosen: dict[str, list[Recipe]] = {}
-    for recipe in best(found).values():
-        chosen.setdefault(recipe.game, []).append(recipe)
-    sentences: dict[str, list[str]] = {}
-    for game, _, text in words.verdicts(found):
-        sentences.setdefault(game, []).append(text)
-    games = sorted({recipe.game for recipe in found})
-    return [_game(game, chosen.get(game, []), sentences.get(game, [])) for game in games]
-
-
-def _game(game: str, chosen: Sequence[Recipe], sentences: Sequence[str]) -> dict[str, Any]:
-    if not chosen:
-        text = f"Nothing was played: the collision rate is {NOT_AVAILABLE}."
-        return {"name": game, "quality": "unknown", "rate": NOT_AVAILABLE, "best": "", "n": "", "sentences": [text]}
-    first = headline(chosen)
-    counts = f"{first.rate.collisions:,} of {first.rate.starts:,}"
-    return {
-        "name": game, "quality": words.quality(first.rate), "rate": words.percent(first.rate.value),
-        "best": f"{first.name} ({first.conditions})", "n": counts, "sentences": list(sentences),
-    }  # fmt: skip
-
-
-def _cards(runs: Sequence[Run], found: Sequence[Recipe]) -> list[dict[str, Any]]:
-    """Heat maps of recipes over their seeds, safest first, then those of single runs."""
-    ordered = sorted(found, key=lambda recipe: (recipe.game, recipe.rate.value or 0.0))
-    pooled = [
-        _card(f"r{k}", names_of(one, "recipe"), one.name, words.seeds(one), one.table)
-        for k, one in enumerate(ordered)
-        if one.runs
+def _games(found: Sequence[Recipe]) -> list[Game]:
+    judged = [(recipe.game, recipe, text) for recipe, text in verdicts.verdicts(found)]
+    chosen = {game: [recipe for own, recipe, _ in judged if own == game] for game in sorted({r.game for r in found})}
+    return [
+        Game(game, headline(own) if own else None, [text for name, _, text in judged if name == game])
+        for game, own in chosen.items()
     ]
+
+
+class Card(NamedTuple):
+    """A heat map with its numbers, of a recipe over its seeds or of a single run."""
+
+    id: str
+    names: dict[str, str]
+    """What it is filtered by."""
+    title: str
+    runs: str
+    """What it is made of."""
+    types: Sequence[TypeCounts]
+    pooled: Pooled
+    numbers: Table
+
+
+def _cards(runs: Sequence[Run], found: Sequence[Recipe]) -> list[Card]:
+    """Recipes, safest first, then single runs."""
+    ordered = sorted((one for one in found if one.types), key=lambda one: (one.game, one.pooled.rate or 0.0))
     names = {run.name: recipe.name for recipe in found for run in recipe.runs}
-    single = [
-        _card(f"s{k}", names_of(run, "run"), names.get(run.name, run.operator), f"seed {run.seed}", run.table)
-        for k, run in enumerate(runs)
-    ]
-    return [card for card in (*pooled, *single) if card["table"]]
-
-
-def _card(identifier: str, names: Mapping[str, str], title: str, counted: str, rows: Sequence[Any]) -> dict[str, Any]:
-    counts, most = total(rows), worst(rows)
-    at = f", worst {words.theta(most.theta)}" if most is not None and most.collisions else ""
-    return {
-        "id": identifier, "names": names, "title": title, "quality": words.quality(counts), "counted": counted,
-        "text": words.share(counts),
-        "interval": words.interval(counts.interval), "worst": at, "table": rows,
-        "map": bool(rows) and len(rows[0].theta) == 2,
-    }  # fmt: skip
+    recipe_cards = [
+        Card(f"r{k}", names_of(one, "recipe"), one.name, verdicts.seeds(one), one.types, one.pooled,
+             type_table(one.types))
+        for k, one in enumerate(ordered)
+    ]  # fmt: skip
+    tables = [(run, by_type(run.table)) for run in runs if run.table]
+    return recipe_cards + [
+        Card(f"s{k}", names_of(run, "run"), names.get(run.name, run.operator), f"seed {run.seed}", types,
+             pool(run.table), type_table(types))
+        for k, (run, types) in enumerate(tables)
+    ]  # fmt: skip
 
 
 def _choices(runs: Sequence[Run], name: str) -> list[str]:
     values = {getattr(run, name) for run in runs}
-    numbers = sorted(value for value in values if isinstance(value, int))
-    return [str(value) for value in numbers] or sorted(str(value) for value in values if value is not None)
+    return [plain(value) for value in sorted(values, key=lambda value: (value is None, 0 if value is None else value))]
 
 
-def _settings(runs: Sequence[Run], found: Sequence[Recipe]) -> tuple[dict[str, str], Any]:
-    """Settings that all runs share, and a table of the others by recipe."""
-    keys = list(dict.fromkeys(key for run in runs for key in run.settings))
-    values = {key: {run.settings.get(key) for run in runs} for key in keys}
-    common = {key: str(next(iter(values[key])))[:300] for key in keys if len(values[key]) == 1}
-    rest = [key for key in keys if len(values[key]) > 1 and key != "seed"]
+def _values(runs: Sequence[Run]) -> dict[str, set[str | None]]:
+    """What runs say of each setting."""
+    return {
+        key: {run.settings.get(key) for run in runs} for key in dict.fromkeys(k for run in runs for k in run.settings)
+    }
+
+
+def _common(runs: Sequence[Run]) -> dict[str, str | None]:
+    """Settings that all runs share."""
+    return {key: next(iter(values)) for key, values in _values(runs).items() if len(values) == 1}
+
+
+def _differing(runs: Sequence[Run], found: Sequence[Recipe]) -> Table | None:
+    """The other settings by recipe."""
+    keys = [key for key, values in _values(runs).items() if len(values) > 1 and key != "seed"]
+    shown = [(recipe, recipe.runs[0].settings) for recipe in found if recipe.runs]
     rows = [
-        {"game": one.game, "recipe": one.name, **{key: one.runs[0].settings.get(key) for key in rest}}
-        for one in found
-        if one.runs
+        {"game": recipe.game, "recipe": recipe.name, **{key: settings.get(key) for key in keys}}
+        for recipe, settings in shown
     ]
-    return common, generic(rows) if rest and rows else None
+    return mapping_table(rows) if keys and rows else None
 
 
 def _versions(runs: Sequence[Run]) -> list[tuple[str, str]]:
     """Packages and the versions that runs had."""
-    found: dict[str, dict[str, int]] = {}
+    found: dict[str, Counter[str]] = {}
     for run in runs:
-        entries = run.content.get("versions")
-        for package, version in entries.items() if isinstance(entries, dict) else ():
-            counts = found.setdefault(str(package), {})
-            counts[str(version)] = counts.get(str(version), 0) + 1
+        for package, version in run.versions.items():
+            found.setdefault(package, Counter())[version] += 1
     return [
-        (
-            package,
-            next(iter(counts)) if len(counts) == 1 else ", ".join(f"{v} ({n} runs)" for v, n in sorted(counts.items())),
-        )
-        for package, counts in found.items()
+        (package, next(iter(n)) if len(n) == 1 else ", ".join(f"{v} ({k} runs)" for v, k in sorted(n.items())))
+        for package, n in found.items()
     ]

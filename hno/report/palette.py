@@ -69,3 +69,19 @@ def chart_config(palette: Palette) -> dict[str, Any]:
 def signals(palette: Palette) -> dict[str, str]:
     """Colours that charts ask for by name."""
     return {"ink": palette.ink, "muted": palette.muted, "danger": palette.danger, "zero": palette.zero}
+
+
+INFERNO = (
+    "#000004", "#160b39", "#420a68", "#6a176e", "#932667", "#bc3754", "#dd513a", "#f37819", "#fca50a", "#f6d746",
+    "#fcffa4",
+)  # fmt: skip
+"""The scale of heat maps in steps of a tenth, for the page's legend."""
+
+
+def variables(palette: Palette) -> str:
+    """Custom properties of the page's style."""
+    names = {name: value for name, value in palette._asdict().items() if isinstance(value, str)}
+    start, end = (round(10 * share) for share in palette.rates)
+    stops = INFERNO[start : end + 1] if start < end else INFERNO[end : start + 1][::-1]
+    pairs = {**names, "rates": f"linear-gradient(to right,{','.join(stops)})", "font": FONT}
+    return "".join(f"--{name}:{value};" for name, value in pairs.items())

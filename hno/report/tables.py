@@ -1,37 +1,25 @@
-"""The tables of a report: plain rows, for the page and for Markdown."""
+"""The tables of a report: columns of `hno.evaluation.sections`, and rows with what they are filtered by."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from hno.report.aggregate import Recipe, Spread, best, excess, seconds, total, worst
-from hno.report.parsing import number as sound
-from hno.report.parsing import whole
-from hno.report.runs import ENDED, NOT_AVAILABLE, Run, label_statistics
-from hno.report.words import interval, number, over_seeds, percent, signed, theta, worst_type
-
-LONGEST = 400
-"""Characters of a cell that are kept."""
-LISTED = 6
-"""Numbers of a list that are shown."""
-ROWS = 200
-"""Rows of any list that are kept."""
-
-
-class Cell(NamedTuple):
-    """A text, and what it is sorted by."""
-
-    text: str
-    order: float | str | None = None
+from hno.evaluation.format import NOT_AVAILABLE, interval, number, percent, signed, types, whole
+from hno.evaluation.outcome import Pooled
+from hno.evaluation.sections import Column, plain, sections
+from hno.report.recipes import Recipe, Spread, TypeCounts, best, pool, seconds
+from hno.report.records import Run
+from hno.report.verdicts import at, over_seeds
 
 
 class Row(NamedTuple):
-    """Cells with what the row is filtered by."""
+    """Values by the names of columns."""
 
-    cells: list[Cell]
+    values: Mapping[str, Any]
     names: Mapping[str, str] = {}
+    """What the row is filtered by."""
     mark: str = ""
     """ "best", "failed" or "unfinished"; empty for any other row."""
 
@@ -39,154 +27,190 @@ class Row(NamedTuple):
 class Table(NamedTuple):
     """Columns and rows."""
 
-    columns: list[str]
-    rows: list[Row]
-    total: int | None = None
-    """Rows that there are, where some may have been left out."""
+    columns: Sequence[Column]
+    rows: Sequence[Row]
 
-    def first(self, count: int) -> Table:
-        """The first rows."""
-        return self._replace(rows=self.rows[:count], total=self.total or len(self.rows))
+    def cells(self, row: Row) -> list[tuple[str, float | None]]:
+        """Texts of a row, each with the number that it is sorted by."""
+        values = [(column, row.values.get(column.name)) for column in self.columns]
+        return [(column.format(value), _order(value)) for column, value in values]
+
+    @property
+    def texts(self) -> list[list[str]]:
+        """Texts of all rows."""
+        return [[text for text, _ in self.cells(row)] for row in self.rows]
+
+
+def _order(value: Any) -> float | None:
+    """A number as it is, of bounds the upper one, of a spread the mean."""
+    if isinstance(value, Spread):
+        return value.mean
+    if isinstance(value, tuple) and value and not isinstance(value[-1], str):
+        value = value[-1]
+    return value if isinstance(value, (int, float)) and not isinstance(value, bool) else None
 
 
 def names_of(entry: Run | Recipe, level: str) -> dict[str, str]:
-    """What an element of the page is filtered by."""
-    seed = {"seed": NOT_AVAILABLE if entry.seed is None else str(entry.seed)} if isinstance(entry, Run) else {}
+    """What an element of the page is filtered by; its level is "recipe", "run" or "any"."""
+    seed = {"seed": plain(entry.seed)} if isinstance(entry, Run) else {}
     return {"level": level, "game": entry.game, "operator": entry.operator, "activation": entry.activation, **seed}
 
 
-RECIPE_COLUMNS = [
-    "game", "recipe", "seeds", "safe starts", "collisions", "rate", "95 % interval", "range over seeds", "worst type",
-    "excess cost", "labels s", "training s", "total s", "open", "failed",
-]  # fmt: skip
+def _worst(found: tuple[Any, float] | None) -> str:
+    """The type with the highest rate: "none" where nothing collided."""
+    if found is None:
+        return NOT_AVAILABLE
+    return "none" if found[0] is None else f"{at(found[0])} {percent(found[1])}"
+
+
+def _rounded(value: float | Spread | None) -> str:
+    return number(value.mean if isinstance(value, Spread) else value, 0)
+
+
+def _labels(found: Spread | None) -> str:
+    """Time for labels; no time is said to be the cache's."""
+    if found is None or found.low > 0:
+        return _rounded(found)
+    return "cached" if found.high == 0 else f"{_rounded(found)} (partly cached)"
+
+
+def _range(found: Spread | None) -> str:
+    return NOT_AVAILABLE if found is None else f"{percent(found.low)} to {percent(found.high)}"
+
+
+CACHED = "Labels that were cached took no time, and the total is then without them."
+COUNTS = (
+    Column("safe_starts", "safe starts", format=whole),
+    Column("collisions", "collisions", format=whole),
+    Column("rate", "rate", format=percent),
+    Column("interval", "95 % interval", format=interval),
+)
+RECIPE = (
+    Column("game", "game"), Column("name", "recipe"), Column("seeds", "seeds", format=whole), *COUNTS,
+    Column("rates", "range over seeds", format=_range), Column("worst", "worst type", format=_worst),
+    Column("excess", "excess cost", format=over_seeds), Column("labels", "labels", "s", _labels),
+    Column("training", "training", "s", _rounded), Column("total", "total", "s", _rounded),
+    Column("unfinished", "open", format=whole), Column("failed", "failed", format=whole),
+)  # fmt: skip
+COST = tuple(one for one in RECIPE if one.name in ("game", "name", "seeds", "labels", "training", "total"))
+"""Seconds of every stage (the paper's cost table)."""
+RUN = (
+    Column("name", "run"), Column("status", "status"), Column("game", "game"), Column("operator", "operator"),
+    Column("activation", "activation"), Column("seed", "seed"), Column("steps", "steps", format=whole), *COUNTS,
+    Column("worst", "worst type", format=_worst), Column("excess", "excess cost", format=signed),
+    Column("value_error", "value error", format=lambda value: number(value, 4)),
+    Column("costate_error", "costate error", format=lambda value: number(value, 4)),
+    Column("total", "total", "s", _rounded),
+)  # fmt: skip
+TYPE = (
+    Column("theta", "θ", format=lambda found: found if isinstance(found, str) else at(found)),
+    Column("counts", "collide"),
+    Column("rate", "rate", format=percent),
+    Column("interval", "95 %", format=interval),
+)
+
+
+def _counts(found: Pooled) -> dict[str, Any]:
+    worst = None if found.worst_rate is None else (found.worst_theta, found.worst_rate)
+    return {**found._asdict(), "worst": worst, "collisions": found.collisions if found.safe_starts else None}
 
 
 def recipe_table(found: Sequence[Recipe]) -> Table:
     """Every recipe over its seeds; the best of each game is marked."""
-    chosen = {id(recipe) for recipe in best(found).values()}
-    rows = [Row(_recipe(one), names_of(one, "any"), "best" if id(one) in chosen else "") for one in found]
-    return Table(RECIPE_COLUMNS, rows)
-
-
-def _recipe(recipe: Recipe) -> list[Cell]:
-    counts, rates, most = recipe.rate, recipe.rates, worst(recipe.table)
-    across = NOT_AVAILABLE if rates is None else f"{percent(rates.low)} to {percent(rates.high)}"
-    return [
-        Cell(recipe.game), Cell(recipe.name), Cell(str(len(recipe.runs)), len(recipe.runs)),
-        Cell(f"{counts.starts:,}", counts.starts), Cell(f"{counts.collisions:,}", counts.collisions),
-        Cell(percent(counts.value), counts.value),
-        Cell(interval(counts.interval), (counts.interval or (None, None))[1]),
-        Cell(across, None if rates is None else rates.high),
-        Cell(worst_type(most), None if most is None else most.collisions / most.starts),
-        Cell(over_seeds(recipe.excess), None if recipe.excess is None else recipe.excess.mean),
-        _cached(recipe.seconds("labels")), *(_seconds(recipe.seconds(part)) for part in ("training", "total")),
-        Cell(str(recipe.unfinished), recipe.unfinished), Cell(str(recipe.failed), recipe.failed),
-    ]  # fmt: skip
-
-
-def _seconds(found: Spread | None) -> Cell:
-    return Cell(NOT_AVAILABLE) if found is None else Cell(number(found.mean, 0), found.mean)
-
-
-CACHED = "Labels that were cached took no time, and the total is then without them."
-
-
-def _cached(found: Spread | None) -> Cell:
-    """Time for labels; no time is said to be the cache's."""
-    if found is None or found.low > 0:
-        return _seconds(found)
-    return Cell("cached" if found.high == 0 else f"{number(found.mean, 0)} (partly cached)", found.mean)
-
-
-RUN_COLUMNS = [
-    "run", "status", "game", "operator", "activation", "seed", "steps", "safe starts", "collisions", "rate",
-    "95 % interval", "worst type", "excess cost", "value error", "costate error", "total s",
-]  # fmt: skip
+    chosen = best(found).values()
+    rows = []
+    for one in found:
+        spent = {stage: one.seconds(stage) for stage in ("labels", "training", "total")}
+        counts = {"seeds": len(one.runs), "unfinished": one.unfinished, "failed": one.failed}
+        values = {**_counts(one.pooled), **counts, **spent, "rates": one.rates, "excess": one.excess}
+        mark = "best" if any(one is other for other in chosen) else ""
+        rows.append(Row({**values, "game": one.game, "name": one.name}, names_of(one, "any"), mark))
+    return Table(RECIPE, rows)
 
 
 def run_table(runs: Sequence[Run]) -> Table:
     """Every single run."""
-    return Table(RUN_COLUMNS, [Row(_run(run), names_of(run, "any"), _mark(run)) for run in runs])
+    return Table(RUN, [Row(_run(run), names_of(run, "any"), _mark(run)) for run in runs])
 
 
 def _mark(run: Run) -> str:
-    return "" if run.finished else (run.status if run.status in ENDED else "unfinished")
+    return "" if run.finished else ("failed" if run.status == "failed" else "unfinished")
 
 
-def _run(run: Run) -> list[Cell]:
-    counts, most, above, steps = total(run.table), worst(run.table), excess(run.table), whole(run.content.get("steps"))
-    metrics = run.content.get("metrics")
-    errors = [
-        sound(metrics.get(f"val/{name}_error")) if isinstance(metrics, dict) else None for name in ("value", "costate")
-    ]
-    spent = seconds(run, "total")
-    played = bool(counts.starts)
-    return [
-        Cell(run.name), Cell(run.status), Cell(run.game), Cell(run.operator), Cell(run.activation),
-        Cell(NOT_AVAILABLE if run.seed is None else str(run.seed), run.seed),
-        Cell(NOT_AVAILABLE if steps is None else f"{steps:,}", steps),
-        Cell(f"{counts.starts:,}", counts.starts),
-        Cell(f"{counts.collisions:,}" if played else NOT_AVAILABLE, counts.collisions if played else None),
-        Cell(percent(counts.value), counts.value),
-        Cell(interval(counts.interval), (counts.interval or (None, None))[1]),
-        Cell(worst_type(most), None if most is None else most.collisions / most.starts), Cell(signed(above), above),
-        *(Cell(number(error, 4), error) for error in errors), Cell(number(spent, 0), spent),
-    ]  # fmt: skip
+def _run(run: Run) -> dict[str, Any]:
+    whole_table = pool(run.table)
+    errors = {f"{name}_error": run.metrics.get(f"val/{name}_error") for name in ("value", "costate")}
+    known = {name: getattr(run, name) for name in ("name", "status", "game", "operator", "activation", "seed", "steps")}
+    return {**_counts(whole_table), **errors, **known, "excess": whole_table.relative_excess,
+            "total": seconds(run, "total")}  # fmt: skip
 
 
-def generic(entries: Sequence[Mapping[str, Any]]) -> Table:
-    """Any list of mappings; columns in the order in which they turn up, those of mappings inside after their name."""
-    rows = [_flat(entry) for entry in entries[:ROWS]]
-    columns = list(dict.fromkeys(key for row in rows for key in row))
-    return Table(
-        columns,
-        [Row([value_cell(row[key], key) if key in row else Cell("") for key in columns]) for row in rows],
-        len(entries),
-    )
+def type_table(found: Iterable[TypeCounts]) -> Table:
+    """Numbers of a heat map."""
+    rows = []
+    for one in found:
+        remarks = [word for word, flag in (("seen", one.seen), ("extrapolated", one.extrapolated)) if flag]
+        theta = " ".join([at(one.theta), *remarks])
+        rows.append(Row({**one._asdict(), "theta": theta, "counts": f"{one.collisions:,} of {one.safe_starts:,}"}))
+    return Table(TYPE, rows)
 
 
-def _flat(entry: Mapping[str, Any]) -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    for key, value in entry.items():
-        name = str(key).replace("_", " ")
-        found |= (
-            {f"{name} {inner}": rest for inner, rest in _flat(value).items()}
-            if isinstance(value, dict)
-            else {name: value}
-        )
+class SectionTable(NamedTuple):
+    """A section of an evaluation."""
+
+    heading: str
+    note: str
+    table: Table
+    remarks: list[str]
+
+
+def section_tables(run: Run) -> list[SectionTable]:
+    """The sections of a run beside its collision table, with the columns that the terminal shows."""
+    found, entries = [], {**run.entries, "clearance": run.clearance, "constraint_unit": run.constraint_unit}
+    for name in sections.names():
+        content = run.entries.get(name)
+        if content:
+            section = sections.get(name)()
+            try:
+                table = Table(section.columns, [Row(row) for row in section.rows(content)])
+                found.append(SectionTable(section.heading, section.note, table, section.remarks(content, entries)))
+                found[-1].table.texts  # noqa: B018  # formats fail on foreign values
+            except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+                said = f"cannot be shown: its entry in results.json is damaged ({type(error).__name__}: {error})"
+                found.append(SectionTable(section.heading, "", Table((), ()), [said]))
     return found
 
 
-def value_cell(value: Any, column: str = "") -> Cell:
-    """Any JSON value; rates and their intervals as percentages, long lists by their length."""
-    found, last = sound(value), column.split(" ")[-1]
-    if value is None:
-        return Cell(NOT_AVAILABLE)
-    if found is not None:
-        text = f"{value:,}" if isinstance(value, int) else f"{found:.4g}"
-        return Cell(percent(found) if last == "rate" and 0 <= found <= 1 else text, found)
-    if isinstance(value, list):
-        numbers = [entry for entry in map(sound, value) if entry is not None]
-        if len(numbers) != len(value) or len(numbers) > LISTED:
-            return Cell(f"{len(value)} entries")
-        return Cell(interval((numbers[0], numbers[1])) if last == "interval" and len(numbers) == 2 else theta(numbers))
-    text = value if isinstance(value, str) else json.dumps(value, sort_keys=True)
-    return Cell(text if len(text) <= LONGEST else f"{text[:LONGEST]}…")
+def mapping_table(entries: Sequence[Mapping[str, Any]]) -> Table:
+    """Any list of mappings; columns in the order in which they turn up."""
+    keys = dict.fromkeys(key for entry in entries for key in entry)
+    columns = [Column(key, key.replace("_", " "), format=_text) for key in keys]
+    return Table(columns, [Row(entry) for entry in entries])
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        return f"{value:,}" if isinstance(value, int) else f"{value:.4g}"
+    if isinstance(value, list) and all(isinstance(entry, (int, float)) for entry in value):
+        return f"({types(value)})"
+    return plain(value) if value is None or isinstance(value, str) else json.dumps(value, sort_keys=True)
 
 
 def label_tables(runs: Sequence[Run]) -> list[tuple[str, int, Table]]:
     """Statistics of training labels: game, how many runs share them, and the table."""
     shared: dict[str, list[Run]] = {}
     for run in runs:
-        if label_statistics(run):
-            shared.setdefault(json.dumps([run.game, label_statistics(run)], sort_keys=True), []).append(run)
+        if run.label_statistics:
+            shared.setdefault(json.dumps([run.game, run.label_statistics], sort_keys=True), []).append(run)
     return [
-        (same[0].game, len(same), generic([_labels(e) for e in label_statistics(same[0])])) for same in shared.values()
+        (same[0].game, len(same), mapping_table([_label_row(entry) for entry in same[0].label_statistics]))
+        for same in shared.values()
     ]
 
 
-def _labels(entry: Mapping[str, Any]) -> dict[str, Any]:
+def _label_row(entry: Mapping[str, Any]) -> dict[str, Any]:
+    """An entry with its counts by status, as far as they are not 0, as columns of their own."""
     status = entry.get("status")
-    counts = {name: count for name, count in status.items() if count != 0} if isinstance(status, dict) else {}
+    counts = {name: count for name, count in status.items() if count} if isinstance(status, dict) else {}
     rest = {key: value for key, value in entry.items() if key != "status"}
     return {"theta": rest.pop("theta", None), "starts": rest.pop("starts", None), **counts, **rest}

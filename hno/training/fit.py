@@ -21,7 +21,7 @@ from hno.training.divergence import StopOnDivergence
 from hno.training.module import TrainingModule
 from hno.training.optimizers import make_optimizer
 from hno.training.polish import polish
-from hno.training.validation import BEST, ClosedLoopValidation, Score
+from hno.training.validation import BEST, ClosedLoopValidation, Later, Score
 from hno.types import Extremal
 
 log = logging.getLogger(__name__)
@@ -77,6 +77,7 @@ def fit(
     folder: Path,
     *,
     validation: Sequence[Extremal] | None = None,
+    later: Later | None = None,
     record: Mapping[str, Any] | None = None,
     loggers: Sequence[Logger] = (),
     callbacks: Sequence[L.Callback] = (),
@@ -92,6 +93,7 @@ def fit(
         folder: where checkpoints go.
         validation: labels of safe starts that closed-loop validation plays, one set per type; without any there is
             none. The safe starts of held-out labels by default.
+        later: all starts, where `validation` are the first of each type only.
         record: entries of checkpoints besides the weights, see `hno.training.checkpoint.record`.
         loggers: of Lightning.
         callbacks: of Lightning, besides those that watch the run.
@@ -108,7 +110,7 @@ def fit(
     if objective.scaled:
         operator.set_scales(Scales(*data.scales()))
     watch = ClosedLoopValidation(folder, settings.validate_every, dt=settings.dt, stop=settings.stop_when_safe)
-    watch.begin(data.safe_held_out() if validation is None else validation)
+    watch.begin(data.safe_held_out() if validation is None else validation, later)
     trainer = make_trainer(settings, folder, loggers, [watch, *callbacks])
     began = time.perf_counter()
     trainer.fit(module, datamodule=data, ckpt_path=resume, weights_only=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,6 +22,8 @@ log = logging.getLogger(__name__)
 
 BEST = "best.ckpt"
 """Name of the best checkpoint inside a run's folder."""
+PROBE = 8
+"""Starts per type that are played first, by default."""
 FEW = 4
 """All starts are played anyway where they are at most so many times the first ones."""
 
@@ -41,6 +43,15 @@ class Score(NamedTuple):
         if not (self.collision_rate == best.collision_rate and self.excess <= best.excess + 0.01):
             return None
         return Score(self.collision_rate, min(self.excess, best.excess))
+
+
+class Later(NamedTuple):
+    """Validation starts whose labels are solved when they are first needed."""
+
+    starts: int
+    """Their number."""
+    solve: Callable[[], Sequence[Extremal]]
+    """Their labels, one set per type that has any."""
 
 
 class Starts(NamedTuple):
@@ -85,18 +96,24 @@ class ClosedLoopValidation(L.Callback):
         stop: whether to end the training as soon as no start collides.
     """
 
-    def __init__(self, folder: Path, every: int, probe: int = 8, dt: float = 0.02, stop: bool = False) -> None:
+    def __init__(self, folder: Path, every: int, probe: int = PROBE, dt: float = 0.02, stop: bool = False) -> None:
         self.path, self.every, self.count, self.dt, self.stop = folder / BEST, every, probe, dt, stop
         self.all: Starts | None = None
+        self.later: Later | None = None
         self.best: Score | None = None
         self.seconds = 0.0
 
-    def begin(self, labels: Sequence[Extremal]) -> None:
-        """Play from the starts of these labels, which are safe, one set per type; without any, play nothing."""
+    def begin(self, labels: Sequence[Extremal], later: Later | None = None) -> None:
+        """Play from the starts of these labels, which are safe, one set per type; without any, play nothing.
+
+        Args:
+            labels: of all starts, or of those that are played first.
+            later: all starts, where `labels` are the first of them; they are solved once none of these collides.
+        """
         if not labels:
             log.info("No validation start has a safe equilibrium: there is no closed-loop validation.")
             return
-        self.all = starts_of(labels)
+        self.all, self.later = starts_of(labels), later
         self.probe = starts_of([part(found, slice(self.count)) for found in labels])
 
     def on_train_batch_end(
@@ -135,11 +152,14 @@ class ClosedLoopValidation(L.Callback):
         data = getattr(trainer, "datamodule", None)
         if isinstance(data, GameData):
             data.visit(played, trainer.global_step)
-        found, count = score(played, probe), len(starts.cost)
+        found, count = score(played, probe), len(starts.cost) if self.later is None else self.later.starts
         if found.collision_rate > 0 and count > FEW * len(probe.cost):
             hits = found.collision_rate * len(probe.cost)
             return found._replace(collision_rate=(hits + count - len(probe.cost)) / count)
-        if count == len(probe.cost):
+        if self.later is not None:
+            self.all, self.later = starts_of(self.later.solve()), None
+            starts = self.all.like(like)
+        if len(starts.cost) == len(probe.cost):
             return found
         return score(rollout(game, policy, starts.x0, starts.theta, self.dt), starts)
 

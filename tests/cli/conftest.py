@@ -13,6 +13,7 @@ import pytest
 import torch
 
 from hno.cli import evaluate, pages, starts, train
+from hno.cli.main import main
 from hno.data import datamodule
 from hno.games import Game, make
 from hno.operators import make_operator
@@ -75,22 +76,15 @@ def command(
     clean_globals: None,
     no_pages: None,
 ) -> Command:
-    """Run train.py or evaluate.py in this process, as the command line would, but without pictures and pages."""
-    monkeypatch.setattr(evaluate, "draw", lambda *arguments: None)
-    mains = {"train": train.main, "evaluate": evaluate.main}
+    """Run a command in this process, as the command line would, but without pictures and pages."""
+    monkeypatch.setattr(evaluate, "draw_typical", lambda *arguments: None)
 
-    def run(name: str, *overrides: str, folder: Path = tmp_path / "run") -> Outcome:
-        monkeypatch.setattr(sys, "argv", [f"{name}.py", *overrides, f"hydra.run.dir={folder}"])
+    def run(name: str, *words: str, folder: Path = tmp_path / "run") -> Outcome:
+        monkeypatch.setattr(sys, "argv", [name])
         capsys.readouterr()
-        code: int | str | None = 0
-        try:
-            mains[name]()
-        except SystemExit as stop:
-            code = stop.code
-        printed = "".join(capsys.readouterr())
-        if isinstance(code, str):
-            code, printed = 1, printed + code
-        return Outcome(code or 0, printed, folder)
+        to = [f"hydra.run.dir={folder}"] if name in ("train", "evaluate") else []
+        code = main([name, *words, *to])
+        return Outcome(code, "".join(capsys.readouterr()), folder)
 
     return run
 

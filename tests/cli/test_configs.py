@@ -1,20 +1,22 @@
 from __future__ import annotations
 
-from collections.abc import Iterator
 from itertools import product
 from pathlib import Path
+from typing import Any
 
-import hydra
 import pytest
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
-from hno.cli.build import build_data, build_game, build_operator, check_numbers, plain
-from hno.cli.config import choices, config_dir, register_plugins
+from hno.cli.arguments import Arguments
+from hno.cli.build import build_architecture, build_data, build_game, build_objective, check, streams
+from hno.cli.config import choices, compose, config_dir, for_hydra, groups, register_plugins
 from hno.cli.results import config_hash
+from hno.cli.schema import TrainSettings
+from hno.data import GameData
 from hno.data.exchange import write_own
 from hno.games import make
 from hno.losses import STREAMS
-from hno.operators.deeponet import nets
+from hno.operators import make_operator
 from tests.fakes import fake_labels
 
 GROUPS = sorted(path.name for path in config_dir().iterdir() if path.is_dir())
@@ -23,40 +25,48 @@ GAMES, OPERATORS, ACTIVATIONS = ("narrow_road", "lane_change", "drone"), ("hno",
 
 
 @pytest.fixture(autouse=True)
-def hydra_here() -> Iterator[None]:
+def plugins() -> None:
     register_plugins()
-    with hydra.initialize_config_dir(str(config_dir()), version_base="1.3"):
-        yield
 
 
 def composed(*overrides: str, name: str = "train") -> DictConfig:
-    """A configuration with all its interpolations resolved and nothing missing."""
-    config = hydra.compose(name, overrides=list(overrides))
-    OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
-    return config
+    """A configuration as a command line composes it."""
+    return compose(name, for_hydra(name, Arguments([], list(overrides), {})))
+
+
+def settings(*overrides: str) -> TrainSettings:
+    """The settings of a training that passes its check."""
+    return check(composed(*overrides))
+
+
+def data_of(chosen: TrainSettings) -> GameData:
+    game = build_game(chosen.game)
+    operator = make_operator(game, build_architecture(chosen))
+    return build_data(chosen, game, streams(build_objective(chosen), operator))
 
 
 @pytest.mark.parametrize(("group", "choice"), CHOICES)
 def test_every_choice_of_every_group_composes(group: str, choice: str) -> None:
-    check_numbers(composed(f"{group}={choice}"))
+    settings(f"{group}={choice}")
+
+
+def test_the_groups_of_the_configuration_are_folders() -> None:
+    assert set(groups("train")) == set(GROUPS)
 
 
 @pytest.mark.parametrize("experiment", [choice for group, choice in CHOICES if group == "experiment"])
 @pytest.mark.parametrize(("game", "operator"), list(product(GAMES, OPERATORS)))
 def test_every_experiment_builds_for_every_game_and_operator(experiment: str, game: str, operator: str) -> None:
-    config = composed(f"experiment={experiment}", f"game={game}", f"operator={operator}")
-    check_numbers(config)
-    built = build_operator(config, build_game(config))
-    needed = {"sno": {"bvp"}, "hno": STREAMS - ({"terminal"} if config.operator.exact_terminal else set())}
-    assert build_data(config, built).streams == needed[operator]
+    chosen = settings(f"experiment={experiment}", f"game={game}", f"operator={operator}")
+    needed = {"sno": {"bvp"}, "hno": STREAMS - ({"terminal"} if chosen.operator["exact_terminal"] else set())}
+    assert data_of(chosen).streams == needed[operator]
 
 
 @pytest.mark.parametrize(
     ("overrides", "members"), [((), 3), (("experiment=paper_grid",), 1), (("operator.members=5",), 5)]
 )
 def test_the_drone_is_a_median_of_nets_unless_asked_otherwise(overrides: tuple[str, ...], members: int) -> None:
-    config = composed("game=drone", *overrides)
-    assert len(nets(build_operator(config, build_game(config)).net)) == members
+    assert settings("game=drone", *overrides).operator["members"] == members
 
 
 @pytest.mark.parametrize(
@@ -65,27 +75,16 @@ def test_the_drone_is_a_median_of_nets_unless_asked_otherwise(overrides: tuple[s
 def test_hybrid_training_ends_supervised_but_in_the_papers_comparison(
     overrides: tuple[str, ...], phases: tuple[int, int, int | None]
 ) -> None:
-    config = composed("operator=hno", "trainer.max_steps=2000", *overrides)
-    assert build_data(config, build_operator(config, build_game(config))).curriculum == phases
+    data = data_of(settings("operator=hno", "trainer.max_steps=2000", *overrides))
+    assert data.collocation.curriculum == phases
 
 
 def test_own_label_files_reach_the_data(tmp_path: Path) -> None:
     game, path = make("narrow_road"), tmp_path / "mine.safetensors"
     write_own(path, game, fake_labels(game, (2.5, 2.5), 12), "a test")
-    config = composed("game=narrow_road", f"data.files=[{path}]", "data.types=[]", "data.validation=2")
-    check_numbers(config)
-    data = build_data(config, build_operator(config, build_game(config)))
+    data = data_of(settings("game=narrow_road", f"data.files=[{path}]", "data.types=[]", "data.validation=2"))
     assert data.type_list == [(2.5, 2.5)]
     assert not data.requests
-    with pytest.raises(ValueError, match=r"data.types must list player types"):
-        check_numbers(composed("data.types=[]"))
-
-
-@pytest.mark.parametrize(("game", "operator", "activation"), list(product(GAMES, OPERATORS, ACTIVATIONS)))
-def test_every_combination_is_built_as_named(game: str, operator: str, activation: str) -> None:
-    config = composed(f"game={game}", f"operator={operator}", f"activation={activation}")
-    built = build_operator(config, build_game(config))
-    assert built.names() == {"game": game, "operator": operator, "activation": activation}
 
 
 def test_every_registered_class_has_a_choice() -> None:
@@ -94,30 +93,63 @@ def test_every_registered_class_has_a_choice() -> None:
     assert set(ACTIVATIONS) <= set(choices("activation"))
 
 
-def test_evaluation_composes() -> None:
-    assert composed("checkpoint=some.ckpt", name="evaluate").theta == "default"
-
-
 def test_physics_stays_out_of_the_configuration() -> None:
     for game in GAMES:
-        assert plain(composed(f"game={game}").game) == {"name": game, "constants": {}}
+        assert composed(f"game={game}").game == {"name": game, "constants": {}}
+
+
+def options(chosen: TrainSettings) -> dict[str, Any]:
+    return {"sampler": chosen.sampler, "loss": chosen.loss.terms, "operator": chosen.operator}
+
+
+def test_every_option_of_what_is_registered_is_in_the_settings() -> None:
+    found = options(settings("operator=hno", "sampler.band=0.5", "sampler.rollout.spread=0.1"))
+    assert found["sampler"]["band"] == {"share": 0.5, "reach": 1.5}
+    assert found["sampler"]["rollout"] == {"share": 0.0, "spread": 0.1}
+    assert found["operator"] == {"name": "hno", "function": "gradient", "exact_terminal": True, "members": 1}
+    assert set(found["loss"]) == {"value", "costate", "boundary", "residual"}
+
+
+def test_any_key_may_be_written_with_or_without_a_plus() -> None:
+    for sign in ("", "+", "++"):
+        chosen = settings(f"{sign}trainer.max_steps=7", f"{sign}game.constants.radius=1.3", f"{sign}activation=tanh")
+        assert (chosen.trainer.max_steps, chosen.game.constants) == (7, {"radius": 1.3})
+        assert chosen.activation == {"name": "tanh"}
+
+
+@pytest.mark.parametrize("key", ["data.types", "evaluation.types", "validation.types"])
+def test_types_need_no_quotes(key: str) -> None:
+    group, name = key.split(".")
+    assert getattr(getattr(settings(f"{key}=1,1;2.5,4"), group), name) == "1,1;2.5,4"
+    assert getattr(getattr(settings(f"{key}=grid5"), group), name) == "grid5"
+
+
+def test_an_experiment_may_have_entries_of_its_own_and_no_command_line_may(tmp_path: Path) -> None:
+    (tmp_path / "experiment").mkdir()
+    file = tmp_path / "experiment" / "mine.yaml"
+    file.write_text("# @package _global_\nmine: {rate: 0.5}\noptimizer:\n  lr: ${mine.rate}\n")
+    given = Arguments([], ["experiment=mine"], {"--config-dir": str(tmp_path)})
+    assert check(compose("train", for_hydra("train", given))).optimizer["lr"] == 0.5
+    with pytest.raises(ValueError, match=r"mine does not exist"):
+        settings("mine.rate=0.5")
 
 
 def test_paper_recipe_is_the_published_one() -> None:
-    config = composed("experiment=paper", "game=lane_change", "operator=sno")
-    assert config.trainer.max_steps == 300_000
-    assert (config.optimizer.name, config.optimizer.lr, config.optimizer.schedule) == ("adam", 1e-4, "constant")
-    assert config.data.trajectories == 2000
-    assert plain(config.sampler) == {"box": 1.0, "band": 0.0, "labels": 0.0, "rollout": 0.0}
-    curriculum = build_data(config, build_operator(config, build_game(config))).curriculum
-    assert curriculum == (100_000, 200_000, None)
+    chosen = settings("experiment=paper", "game=lane_change", "operator=sno")
+    assert chosen.trainer.max_steps == 300_000
+    assert chosen.optimizer == {"name": "adam", "lr": 1e-4, "schedule": "constant", "final_lr": 3e-5, "fused": True}
+    assert chosen.data.trajectories == 2000
+    assert {name: entry["share"] for name, entry in chosen.sampler.items()} == {
+        "box": 1.0, "band": 0.0, "labels": 0.0, "rollout": 0.0,
+    }  # fmt: skip
+    assert data_of(chosen).collocation.curriculum == (100_000, 200_000, None)
 
 
 def test_hash_names_what_determines_the_numbers() -> None:
-    base = config_hash(composed())
-    assert config_hash(composed()) == base
-    for same in ("logger=csv", "resume=/some/last.ckpt", "data.cache=/some", "data.workers=1", "trainer.threads=1"):
-        assert config_hash(composed(same)) == base
+    base = config_hash(settings())
+    assert config_hash(settings()) == base
+    for same in ("logger=csv", "data.cache=/some", "data.workers=1", "trainer.threads=1"):
+        assert config_hash(settings(same)) == base
     for other in (
         "seed=1",
         "game=drone",
@@ -126,7 +158,7 @@ def test_hash_names_what_determines_the_numbers() -> None:
         "optimizer.lr=1e-4",
         "data.trajectories=8",
     ):
-        assert config_hash(composed(other)) != base
+        assert config_hash(settings(other)) != base
 
 
 def test_configuration_is_found_beside_the_package() -> None:

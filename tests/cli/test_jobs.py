@@ -112,7 +112,7 @@ def test_an_interrupted_multirun_shows_what_there_is(
 
     monkeypatch.setattr(train, "train", task)
     printed: list[int] = []
-    monkeypatch.setattr("hno.cli.config.show_jobs", lambda jobs: printed.extend(job.number for job in jobs))
+    monkeypatch.setattr("hno.cli.launch.show_jobs", lambda jobs: printed.extend(job.number for job in jobs))
     with pytest.raises(KeyboardInterrupt):
         command("train", "-m", f"hydra.sweep.dir={tmp_path}/sweep", *SMOKE, "seed=0,1,2")
     assert printed == [0, 1]
@@ -126,13 +126,27 @@ def test_a_single_run_ends_with_its_page(command: Command) -> None:
 
 def test_a_failed_run_has_a_page_with_its_reason(command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pages, "write", write_page)
-    run = command("train", *SMOKE, "trainer.max_steps=0")
+    run = command("train", *SMOKE, "data.cache=/proc/nowhere")
     assert run.code == 1
     assert f"Page: {run.folder / pages.PAGE}" in run.text.splitlines()
-    assert "trainer.max_steps must be a whole number" in (run.folder / pages.PAGE).read_text()
+    assert "Labels cannot be written" in (run.folder / pages.PAGE).read_text()
 
 
-def test_without_results_there_is_no_page(command: Command) -> None:
-    run = command("evaluate")
+def test_a_job_that_is_refused_leaves_its_reason_and_no_page(
+    command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(train, "train", lambda settings: True)
+    sweep = f"hydra.sweep.dir={tmp_path}/sweep"
+    run = command("train", "-m", sweep, *SMOKE, "operator=hno,sno", "loss.weights.residual=0.1")
     assert run.code == 1
-    assert "Page:" not in run.text
+    found = {folder.name[2:]: folder for folder in (tmp_path / "sweep").glob("[0-9]*")}
+    assert not (found["narrow_road_hno_sin"] / "results.json").exists()
+    left = Outcome(0, "", found["narrow_road_sno_sin"]).results
+    assert (left["status"], left["operator"]) == ("failed", "sno")
+    assert "needs a weight and every weight a term" in left["reason"]
+    assert not list((tmp_path / "sweep").rglob("report.html"))
+
+
+def test_one_job_is_no_jobs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    show_jobs([job(tmp_path, 0)])
+    assert "1 job\n" in capsys.readouterr().out.replace(" \n", "\n").replace("  ", "")

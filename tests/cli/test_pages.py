@@ -25,6 +25,6 @@ def test_a_missing_package_or_a_folder_without_runs_is_said(tmp_path: Path, monk
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "altair", None)
     line = pages.write(tmp_path / "a run")
-    assert "needs the package altair: pip install 'hno[report]'" in line
-    assert f"python -m hno.report '{tmp_path / 'a run'}'" in line
+    assert "needs the package altair: pip install altair jinja2 pillow vl-convert-python" in line
+    assert f"hno report '{tmp_path / 'a run'}'" in line
     assert not (tmp_path / "a run" / "report.html").exists()

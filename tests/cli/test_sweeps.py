@@ -7,19 +7,22 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-import hydra
 import pytest
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 from wandb.sdk.launch.sweeps.utils import create_sweep_command, create_sweep_command_args
 
 from hno.cli import train
-from hno.cli.build import build_game, build_operator, check_numbers
-from hno.cli.config import config_dir, register_plugins
+from hno.cli.arguments import Arguments
+from hno.cli.build import check
+from hno.cli.config import compose, for_hydra
 from hno.cli.media import numbers
+from hno.cli.schema import TrainSettings
+from hno.games import games
 from tests.cli.conftest import SMOKE, Command
 from tests.cli.test_train import losses
 from tests.report.tables import type_row
+from tests.walkers import Walkers
 
 SWEEPS = sorted((Path(__file__).parents[2] / "sweeps").glob("*.yaml"))
 GAMES, OPERATORS, ACTIVATIONS = ("narrow_road", "lane_change", "drone"), ("hno", "sno"), ("tanh", "sin", "relu")
@@ -55,14 +58,6 @@ def arguments(sweep: dict[str, Any], chosen: dict[str, Any]) -> list[str]:
     ]
 
 
-@pytest.fixture
-def hydra_here() -> Iterator[None]:
-    register_plugins()
-    with hydra.initialize_config_dir(str(config_dir()), version_base="1.3"):
-        yield
-
-
-@pytest.mark.usefixtures("hydra_here")
 @pytest.mark.parametrize("path", SWEEPS, ids=lambda path: path.stem)
 def test_parameters_of_a_sweep_are_configuration_keys(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("WANDB_SWEEP_ID", "s1")
@@ -74,14 +69,11 @@ def test_parameters_of_a_sweep_are_configuration_keys(path: Path, monkeypatch: p
         for value in some:
             env, python, program, *overrides = arguments(sweep, first | {name: value})
             assert (env, python, program) == ("/usr/bin/env", "python", "train.py")
-            config = hydra.compose("train", overrides=overrides, return_hydra_config=True)
-            assert config.hydra.run.dir == "outputs/sweeps/s1/r1"
+            config = compose("train", for_hydra("train", Arguments([], overrides, {})))
+            assert HydraConfig.get().run.dir == "outputs/sweeps/s1/r1"
             got = OmegaConf.select(config, name)
             assert (got.name if OmegaConf.is_dict(got) else got) == value
-            with monkeypatch.context() as patch:
-                patch.setattr(HydraConfig, "get", lambda config=config: config.hydra)
-                check_numbers(config)
-    build_operator(config, build_game(config))
+            check(config)
 
 
 def test_the_metric_of_every_sweep_is_logged(command: Command) -> None:
@@ -106,17 +98,16 @@ def grid(command: Command, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> I
     def jobs(*overrides: str) -> Grid:
         made: Grid = []
 
-        def take(config: DictConfig) -> bool:
-            check_numbers(config)
-            tests = config.evaluation
+        def take(chosen: TrainSettings) -> bool:
+            tests, names = chosen.evaluation, (chosen.operator["name"], chosen.activation["name"])
             made.append((
-                config.game.name, config.operator.name, config.activation.name, config.seed, config.optimizer.lr,
-                tests.starts, tests.safe, len(tests.types), config.trainer.max_steps,
+                chosen.game.name, *names, chosen.seed, chosen.optimizer["lr"], tests.starts, tests.safe,
+                len(tests.types), chosen.trainer.max_steps,
             ))  # fmt: skip
             return True
 
         monkeypatch.setattr(train, "train", take)
-        monkeypatch.setattr("hno.cli.config.show_jobs", lambda jobs: None)
+        monkeypatch.setattr("hno.cli.launch.show_jobs", lambda jobs: None)
         run = command("train", *overrides, "experiment=paper_grid", f"hydra.sweep.dir={tmp_path}/sweep")
         assert run.code == 0, run.text
         return made
@@ -142,6 +133,6 @@ def test_one_cell_of_the_grid(grid: Any) -> None:
     assert grid("activation=relu") == [("narrow_road", "sno", "relu", 0, 1e-2, 200, True, 25, 2000)]
 
 
-def test_games_and_activations_of_ones_own_have_a_place_in_the_grid(grid: Any) -> None:
-    made = grid("game.name=hallway", "activation.name=softplus")
-    assert made == [("hallway", "sno", "softplus", 0, 3e-3, 200, True, 25, 2000)]
+def test_games_of_ones_own_have_a_place_in_the_grid(grid: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(games, "_classes", {**games._classes, "walkers": Walkers})
+    assert grid("game=walkers") == [("walkers", "sno", "sin", 0, 3e-3, 200, True, 25, 2000)]

@@ -12,7 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from hno.evaluation.closed_loop import TypeRow
 from hno.evaluation.metrics import clopper_pearson
+from hno.evaluation.outcome import Outcome
 
 GRID5 = tuple(itertools.product((1.0, 2.0, 3.0, 4.0, 5.0), repeat=2))
 GRID9 = tuple(itertools.product(np.arange(1, 5.5, 0.5).tolist(), repeat=2))
@@ -29,13 +31,16 @@ interval = functools.cache(clopper_pearson)
 
 def row(theta: tuple[float, ...], collisions: int, starts: int = STARTS, **entries: Any) -> dict[str, Any]:
     """A row of the collision table."""
-    return {
-        "theta": list(theta), "seen": theta in CORNERS, "starts": starts, "unsolved": 0, "inevitable": 0, "marginal": 0,
-        "marginal_collisions": 0, "safe_starts": starts, "collisions": collisions,
-        "rate": collisions / starts if starts else None, "interval": interval(collisions, starts),
-        "median_min_distance": 2.0 if starts else None, "median_excess_cost": 0.1 if starts else None,
-        "median_label_cost": 10.0 if starts else None, **entries,
-    }  # fmt: skip
+    some = starts > 0
+    outcome = Outcome(
+        starts=starts, unsolved=0, inevitable=0, marginal=0, marginal_collisions=0, safe_starts=starts,
+        collisions=collisions, rate=collisions / starts if some else None, interval=interval(collisions, starts),
+        median_min_distance=2.0 if some else None, distance_quantiles=(1.0, 1.5, 2.0) if some else None,
+        median_excess_cost=0.1 if some else None, largest_excess_cost=1.0 if some else None,
+        median_excess_costs=(0.05, 0.05) if some else None, median_label_cost=10.0 if some else None,
+        saturated=0.1 if some else None,
+    )  # fmt: skip
+    return TypeRow(theta, theta in CORNERS, False, False, outcome, 0.02, 0.04).content() | entries
 
 
 def collision_radius(game: str, theta: tuple[float, ...]) -> float:
@@ -82,7 +87,7 @@ def make_results(
         "data": {"types": [list(t) for t in sorted(CORNERS)], "cache": None},
     }  # fmt: skip
     return {
-        "schema": 2, "status": "finished", "reason": None, "game": game, "operator": operator, "activation": activation,
+        "status": "finished", "reason": None, "game": game, "operator": operator, "activation": activation,
         "seed": seed, "steps": 2000, "config_hash": "0" * 16, "checkpoint": "best.ckpt",
         "seconds": {"labels": 36.0, "training": round(50 + 20 * rng.random(), 1), "validation": 6.0, "evaluation": 8.0},
         "metrics": {"loss/total": 0.05, "val/value_error": 0.02, "val/costate_error": 0.04},
@@ -95,8 +100,8 @@ def make_results(
             }
             for theta in sorted(CORNERS)
         ],
-        "clearance": 0.02, "dt": 0.02, "widen": 1.0, "noise": 0.0, "delay": 0, "test_seed": 1000,
-        "table": table, "episodes": "episodes.json",
+        "clearance": 0.02, "constraint_unit": "m", "dt": 0.02, "widen": 1.0, "noise": 0.0, "delay": 0,
+        "test_seed": 1000, "table": table, "episodes": "episodes.json",
         "versions": {"hno": "0.1.0", "python": "3.11.2", "torch": "2.13.0", "lightning": "2.6.6"}, **entries,
     }  # fmt: skip
 

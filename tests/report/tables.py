@@ -5,21 +5,15 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from hno.evaluation.closed_loop import TypeRow
-from hno.evaluation.metrics import clopper_pearson
-from hno.evaluation.outcome import Outcome
+from tests.report.folders import row
 
 
 def type_row(
     theta: tuple[float, ...], collisions: int, safe: int, excess: float = 1.0, cost: float = 10.0, seen: bool = True
 ) -> dict[str, Any]:
     """One row of results.json's table."""
-    some = safe > 0
-    found = Outcome(
-        safe + 1, 0, 1, 0, 0, safe, collisions, collisions / safe if some else None, clopper_pearson(collisions, safe),
-        2.0 if some else None, None, excess if some else None, None, None, cost if some else None, None,
-    )  # fmt: skip
-    return TypeRow(theta, seen, False, False, found, None, None).content()
+    costs = {"median_excess_cost": excess, "median_label_cost": cost} if safe else {}
+    return row(theta, collisions, safe) | {"seen": seen, "starts": safe + 1, "inevitable": 1, **costs}
 
 
 def episode(theta: tuple[float, float], clearance: float, dimensions: int = 2, frames: int = 4) -> dict[str, Any]:

@@ -8,10 +8,11 @@ import xml.etree.ElementTree as ET
 import numpy as np
 import pytest
 
-from hno.report.figures import heat_cells, markdown, summary, write_figures
-from hno.report.grouping import recipes
-from hno.report.kernels import condition_table
-from hno.report.parsing import TypeResult
+from hno.report import charts, vega
+from hno.report.condition_numbers import condition_table
+from hno.report.figures import markdown, summary, write_figures
+from hno.report.recipes import by_type, recipes
+from hno.report.records import type_row
 from hno.report.runs import load
 from tests.report.folders import GRID5, make_results, row, write_run
 
@@ -44,7 +45,7 @@ def test_the_summary_repeats_the_counts(tmp_path):
     found = recipes(sweep.runs)
     content = json.loads(summary(sweep, found))
     (recipe,) = content["recipes"]
-    assert (recipe["collisions"], recipe["starts"], recipe["failed"]) == (3, 150, 1)
+    assert (recipe["collisions"], recipe["safe_starts"], recipe["failed"]) == (3, 150, 1)
     assert recipe["types"][0]["theta"] == [1.0, 1.0]
     assert content["missing"][0]["reason"] == "a | b\n<i>"
     text = markdown(sweep, found)
@@ -73,8 +74,8 @@ def test_figures_show_their_counts(tmp_path):
     ("collisions", "starts", "label"), [(0, 9, "0"), (1, 10_000, "<0.1"), (1, 1000, "0.1"), (1, 2, "50"), (0, 0, "n/a")]
 )
 def test_a_cell_never_rounds_a_collision_away(collisions, starts, label):
-    (cell,) = heat_cells([TypeResult((1.0, 1.0), True, collisions, starts, None, None, None)])
-    assert cell["label"] == label
+    (counts,) = by_type([type_row(row((1.0, 1.0), collisions, starts))])
+    assert label in drawn(vega.svg(charts.heat_map(vega.inline([counts._asdict()]))))
 
 
 def kernel(condition, rank=8):
@@ -97,7 +98,8 @@ def test_ratios_of_condition_numbers_are_bounds_where_a_kernel_is_cut_off(tmp_pa
         write_run(tmp_path / activation, results(activation, ntk=section), extras=False)
     table = condition_table(load(tmp_path).runs)
     (line,) = table.rows
-    cells = dict(zip(table.columns, (cell.text for cell in line.cells), strict=True))
+    cells = dict(zip((column.title for column in table.columns), table.cells(line), strict=True))
+    cells = {title: text for title, (text, _) in cells.items()}
     assert cells["kernel"] == "J J'"
     assert cells.get("tanh / sin", "n/a") == ratio
     assert cells["tanh / relu"] != "n/a"
@@ -109,6 +111,6 @@ def test_kernels_of_different_points_or_runs_are_lines_of_their_own(tmp_path):
         section = [{"theta": [1.0, 1.0], "points": points, "kernel": kernel(condition), "product": None}]
         write_run(tmp_path / name, results(activation, ntk=section), extras=False)
     table = condition_table(load(tmp_path).runs)
-    lines = [dict(zip(table.columns, (cell.text for cell in line.cells), strict=True)) for line in table.rows]
+    lines = [dict(zip((column.title for column in table.columns), line, strict=True)) for line in table.texts]
     shown = [[line[name] for name in ("points", "run", "tanh", "sin", "tanh / sin")] for line in lines]
     assert shown == [["4", "2", "600", "300", "2"], ["4", "3", "600", "100", "6"], ["40", "", "n/a", "200", "n/a"]]

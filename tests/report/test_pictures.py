@@ -1,50 +1,46 @@
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable
+import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import Any
 
 import pytest
-from matplotlib.animation import FuncAnimation
-from matplotlib.figure import Figure
 from PIL import Image
 
-from hno.report.collision_map import collision_map
-from hno.report.gif import animate
-from hno.report.picture import PlotsMissingError
+from hno.report import pictures, vega
+from hno.report.episode import episode as read
+from hno.report.pictures import collision_map, rollout_picture
 from tests.report.tables import episode, type_row
 
 TABLE = [type_row((1, 1), 0, 200), type_row((1, 5), 10, 200, seen=False), type_row((5, 1), 0, 0)]
 
 
-@pytest.fixture
-def drawn(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[list[dict[str, Any]]], Figure]:
-    """The figure that a map is saved from."""
-
-    def draw(table: list[dict[str, Any]]) -> Figure:
-        kept: list[Figure] = []
-        with monkeypatch.context() as patch:
-            patch.setattr(Figure, "savefig", lambda self, *_, **__: kept.append(self))
-            collision_map(table, tmp_path / "map.png", "a game")
-        return kept[0]
-
-    return draw
+def drawn(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, table: list[dict[str, Any]]) -> ET.Element:
+    """The map as SVG."""
+    kept: list[str] = []
+    with monkeypatch.context() as patch:
+        patch.setattr(vega, "png", lambda chart, *_: kept.append(vega.svg(chart)) or b"")
+        collision_map(table, tmp_path / "map.png", "a game")
+    return ET.fromstring(kept[0])
 
 
-def test_every_cell_says_its_rate_and_its_number_of_starts(drawn: Callable[..., Figure]) -> None:
-    axes = drawn(TABLE).axes[0]
-    cells = {text.get_position(): text.get_text() for text in axes.texts}
-    assert cells == {(0, 0): "0 %\nof 200", (0, 1): "5 %\nof 200", (1, 0): "n/a\nof 0"}
-    assert [label.get_text() for label in axes.get_xticklabels()] == ["1", "5"]
+def test_every_cell_says_its_rate_and_its_number_of_starts(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    texts = [text for text in drawn(monkeypatch, tmp_path, TABLE).itertext() if text.strip()]
+    assert {"0", "5.0", "n/a", "of 0", "a game"} <= set(texts)
+    assert texts.count("of 200") == 2
 
 
-def test_seen_types_are_framed_and_colours_follow_the_rate(drawn: Callable[..., Figure]) -> None:
-    safe, unsafe, unknown = drawn(TABLE).axes[0].patches
-    assert [patch.get_linewidth() > 1 for patch in (safe, unsafe, unknown)] == [True, False, True]
-    brightness = [sum(patch.get_facecolor()[:3]) for patch in (safe, unsafe)]
-    assert brightness[0] > brightness[1]
-    assert len(set(unknown.get_facecolor()[:3])) == 1, "grey: neither safe nor unsafe"
+def rectangles(found: ET.Element) -> list[dict[str, str]]:
+    places = (path.attrib for path in found.iter() if path.tag.endswith("path"))
+    return [place for place in places if place.get("d", "").count("A") + place.get("d", "").count("C") >= 4]
+
+
+def test_seen_types_are_framed_and_colours_follow_the_rate(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    worse = [*TABLE[:2], type_row((5, 1), 150, 200, seen=False)]
+    few, more = (rectangles(drawn(monkeypatch, tmp_path, table)) for table in (TABLE, worse))
+    framed = [place for place in few if place.get("stroke-width") == "2"]
+    assert len(framed) == sum(row["seen"] for row in TABLE) == 2
+    assert len({place["fill"] for place in more if place.get("fill", "").startswith(("#", "rgb"))}) >= 3
 
 
 @pytest.mark.parametrize("table", [[], [type_row((1, 1, 1), 0, 9)]])
@@ -55,38 +51,36 @@ def test_a_map_needs_two_players_and_rows(table: list[dict[str, Any]], tmp_path:
 
 
 @pytest.mark.parametrize("dimensions", [2, 3])
-def test_an_animation_has_a_frame_for_each_time_and_they_differ(dimensions: int, tmp_path: Path) -> None:
-    animate(episode((1, 5), 0.3, dimensions), tmp_path / "worst.gif", "a game")
-    with Image.open(tmp_path / "worst.gif") as image:
-        assert image.n_frames == 4
-        frames = []
-        for index in range(4):
-            image.seek(index)
-            frames.append(image.convert("RGB").tobytes())
-    assert len(set(frames)) == 4
-    assert image.info["duration"] == 500, "as fast as the episode: two frames a second"
+def test_a_rollout_has_a_view_for_every_plane_and_the_distance(
+    dimensions: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept: list[str] = []
+    png = vega.png
+    monkeypatch.setattr(vega, "png", lambda chart: kept.append(vega.svg(chart)) or png(chart))
+    rollout_picture(read(episode((1, 5), 0.3, dimensions)), tmp_path / "rollout.png", "a game")
+    axes = [[text for text in ET.fromstring(found).itertext() if text.endswith(("[m]", "[s]"))] for found in kept]
+    assert axes == [["x [m]", "y [m]"], ["x [m]", "z [m]"], ["t [s]", "distance [m]"]][: dimensions - 1] + axes[-1:]
+    assert axes[-1] == ["t [s]", "distance [m]"]
+    assert "a game" in kept[0]
 
 
-def test_frames_show_the_time_and_the_paths_so_far(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    seen: list[tuple[str, list[int], list[float]]] = []
-
-    def look(self: Any, *_: object, **__: object) -> None:
-        self._draw_was_started = True  # it would warn otherwise
-        for frame in self.new_frame_seq():
-            self._func(frame)
-            axes = self._fig.axes[0]
-            lengths = [len(line.get_xdata()) for line in axes.lines]
-            seen.append((self._fig.get_suptitle(), lengths, [disc.radius for disc in axes.patches]))
-
-    monkeypatch.setattr(FuncAnimation, "save", look)
-    animate(episode((1, 5), 0.3, frames=3), tmp_path / "worst.gif", "a game")
-    assert seen == [(f"a game, t = {0.5 * k:.2f} s", [k + 1] * 2, [0.75] * 2) for k in range(3)]
+def test_a_view_shows_paths_up_to_its_frame_and_discs_that_turn_red() -> None:
+    found = read(episode((1, 5), -0.3, frames=5))
+    shown = [vega.svg(pictures.view(found, "y", frame, follow=False)) for frame in (0, 4)]
+    paths = [
+        max(len(path.get("d", "").split("L")) for path in ET.fromstring(text).iter() if path.tag.endswith("path"))
+        for text in shown
+    ]
+    assert paths[0] < paths[1]
 
 
-def test_without_matplotlib_the_remedy_is_said(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    for module in ("matplotlib.figure", "matplotlib.colors", "matplotlib.animation"):
-        monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(PlotsMissingError, match=r"hno\[plots\]"):
-        collision_map(TABLE, tmp_path / "map.png", "a game")
-    with pytest.raises(PlotsMissingError, match=r"hno\[plots\]"):
-        animate(episode((1, 5), 0.3), tmp_path / "worst.gif", "a game")
+@pytest.mark.parametrize(("players", "radius"), [(1, None), (2, None), (2, 1.5), (3, 1.5)])
+def test_a_rollout_is_drawn_for_any_number_of_players(players: int, radius: float | None, tmp_path: Path) -> None:
+    found = episode((1, 5), 0.3)
+    found["positions"] = [[*places, [0.0, 9.0]][-players:] for places in found["positions"]]
+    found["radius"] = None if radius is None else [radius] * 4
+    rollout_picture(read(found), tmp_path / "rollout.png", "a game")
+    with Image.open(tmp_path / "rollout.png") as image:
+        colors = image.convert("RGB").getcolors(1 << 24)
+    assert colors is not None
+    assert len(colors) > 50, "more than an empty frame"

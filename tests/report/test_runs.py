@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hno.report.runs import NoRunsError, Run, load
+from hno.report.records import Run
+from hno.report.runs import NoRunsError, load
 from tests.report.folders import GRID5, make_results, row, write_run, write_sweep
 
 DRONE = make_results("drone", "sno", "tanh", 0, np.random.default_rng(0), GRID5[:3])
@@ -21,14 +22,14 @@ def only(folder: Path) -> Run:
 
 def test_a_whole_run_is_read_without_remarks(tmp_path):
     run = only(write_run(tmp_path / "run", DRONE))
-    assert run.notes == ()
+    assert run.notes == []
     assert (run.name, run.status, run.game, run.seed) == ("run", "finished", "drone", 0)
     assert len(run.table) == 3
     assert len(run.episodes) == 6
     assert run.episodes[0].positions.shape == (51, 2, 3)
     assert run.settings["operator.width"] == "64"
     assert "game.constants" not in run.settings
-    assert len(run.curves["loss/total"][0]) == 40
+    assert len(run.curves["loss/total"]) == 40
     assert run.command == "python train.py game=drone operator=sno activation=tanh seed=0"
 
 
@@ -97,11 +98,12 @@ def test_a_folder_without_runs_is_refused(tmp_path, folder):
     ("bad", "reason"),
     [
         (row((1.0, 1.0), 3) | {"collisions": 300}, "300 collisions of 200"),
-        (row((1.0, 1.0), 3) | {"collisions": None}, "None collisions"),
-        (row((1.0, 1.0), 3) | {"safe_starts": True}, "of True"),
+        (row((1.0, 1.0), 3) | {"collisions": None}, "outcome.collisions: input should be a valid integer, got None"),
+        (row((1.0, 1.0), 3) | {"safe_starts": True}, "outcome.safe_starts: input should be a valid integer, got True"),
         (row((1.0, 1.0), 3) | {"theta": "1,1"}, "theta"),
+        (row((1.0, 1.0), 3) | {"median_excess_cost": float("nan")}, "finite"),
         (row((1.0, 1.0), 3) | {"theta": [1, None]}, "theta"),
-        ("nonsense", "expected a row"),
+        ("nonsense", "expected an object, got 'nonsense'"),
     ],
 )
 def test_rows_that_contradict_themselves_are_left_out_and_named(tmp_path, bad, reason):
@@ -113,7 +115,7 @@ def test_rows_that_contradict_themselves_are_left_out_and_named(tmp_path, bad, r
 def test_a_metrics_file_that_is_being_written_gives_its_whole_lines(tmp_path):
     folder = write_run(tmp_path / "run", DRONE)
     (folder / "csv" / "metrics.csv").write_text("loss/total,step\n0.5,1\nnan,2\n0.25,3\n0.1")
-    assert only(folder).curves == {"loss/total": ([1, 3], [0.5, 0.25])}
+    assert only(folder).curves == {"loss/total": [(1, 0.5), (3, 0.25)]}
 
 
 def test_missing_and_damaged_companions_are_named(tmp_path):
@@ -122,7 +124,7 @@ def test_missing_and_damaged_companions_are_named(tmp_path):
     (folder / "episodes.json").write_text("{")
     (folder / ".hydra" / "overrides.yaml").write_text("[: :")
     run = only(folder)
-    assert (run.curves, run.episodes, run.command) == ({}, (), None)
+    assert (run.curves, run.episodes, run.command) == ({}, [], None)
     assert len(run.notes) == 2
 
 
@@ -141,16 +143,14 @@ def test_episodes_end_where_they_stop_being_finite(tmp_path):
 def test_episodes_outside_the_folder_are_not_read(tmp_path):
     secret = write_run(tmp_path / "other", DRONE)
     run = only(write_run(tmp_path / "runs" / "run", {**DRONE, "episodes": str(secret / "episodes.json")}, extras=False))
-    assert run.episodes == ()
+    assert run.episodes == []
 
 
-def test_schemas(tmp_path):
-    write_run(tmp_path / "0", {**DRONE, "schema": 1}, extras=False)
-    write_run(tmp_path / "1", {**DRONE, "schema": 3, "seed": 1}, extras=False)
-    old, new = load(tmp_path).runs
-    assert old.notes[:-1] == ()
-    assert any("schema 3" in note for note in new.notes)
-    assert len(new.table) == 3
+def test_an_entry_of_the_wrong_kind_is_named_in_one_sentence(tmp_path):
+    write_run(tmp_path / "good", DRONE, extras=False)
+    write_run(tmp_path / "bad", {**DRONE, "seconds": {"labels": "soon"}}, extras=False)
+    (skipped,) = load(tmp_path).skipped
+    assert skipped.reason == ("results.json is not hno's: seconds.labels: input should be a valid number, got 'soon'")
 
 
 def test_every_model_of_an_evaluation_is_a_run(tmp_path):
@@ -173,6 +173,6 @@ def test_every_model_of_an_evaluation_is_a_run(tmp_path):
     }
     first, second = load(write_run(tmp_path / "evaluation", results, extras=False)).runs
     assert (first.operator, second.operator) == ("hno", "sno")
-    assert [run.table[0].collisions for run in (first, second)] == [0, 1]
+    assert [run.table[0].outcome.collisions for run in (first, second)] == [0, 1]
     assert [run.settings["checkpoint"] for run in (first, second)] == ["hno.ckpt", "sno.ckpt"]
-    assert ["comparison" in run.content for run in (first, second)] == [True, False]
+    assert ["comparison" in run.entries for run in (first, second)] == [True, False]

@@ -42,37 +42,11 @@ async function draw(host, name, data, values = {}, renderer = "svg") {
   return made.view;
 }
 
-/** Values of one axis of the type space, in order. */
-const axis = (cells, player) => [...new Set(cells.map(([theta]) => theta[player]))].sort((a, b) => a - b);
-
 function drawHeat(host) {
-  const which = $("shown").value;
   const cells = DATA.maps[host.dataset.of];
-  const [first, second] = [axis(cells, 0), axis(cells, 1)];
-  const known = new Map(cells.map((cell) => [cell[0].join(), cell]));
-  const step = Math.max(13, Math.min(38, Math.floor((host.clientWidth - 44) / first.length)));
-  const rows = second.flatMap((b) => first.map((a) => heatCell(known.get([a, b].join()), a, b, which, step)));
-  draw(host, "heat", { cells: rows }, { x_step: step, y_step: step });
-}
-
-const inPercent = (rate) => (rate < 0.0005 ? "<0.1" : (100 * rate).toFixed(rate < 0.0995 ? 1 : 0));
-
-function heatCell(cell, a, b, which, step) {
-  const names = { theta_1: a, theta_2: b };
-  if (!cell) return { ...names, shown: undefined, label: "", seen: false, tip: `types ${types([a, b])}\nnot evaluated` };
-  const [theta, hits, starts, seen, excess, extrapolated] = cell;
-  const bounds = DATA.intervals[`${hits}/${starts}`];
-  const rate = starts ? hits / starts : null;
-  const shown = which === "rate" || !bounds ? rate : bounds[1];
-  const label = shown === null ? "–" : shown === 0 ? "0" : step < 20 ? "" : inPercent(shown);
-  const tip = [
-    `types ${types(theta)}, ${seen ? "seen in training" : "without training labels"}`,
-    extrapolated ? "outside the type box: extrapolated" : "",
-    starts ? `${hits} of ${starts} safe starts collide: ${percent(rate)}` : "no safe start: rate n/a",
-    bounds ? `95 % interval ${percent(bounds[0])} to ${percent(bounds[1])}` : "",
-    excess === null ? "" : `median excess cost ${excess < 0 ? "" : "+"}${(100 * excess).toFixed(1)} %`,
-  ];
-  return { ...names, shown, label, seen: Boolean(seen), tip: tip.filter(Boolean).join("\n") };
+  const columns = new Set(cells.map((cell) => cell.theta[0])).size;
+  const step = Math.max(13, Math.min(38, Math.floor((host.clientWidth - 44) / columns)));
+  draw(host, "heat", { cells }, { x_step: step, y_step: step, small: step < 26, bound: $("shown").value });
 }
 
 function drawComparison(host) {
@@ -83,13 +57,9 @@ function drawComparison(host) {
 function drawCurves(host) {
   const metric = $("metric").value;
   const told = DATA.curves.filter((curve) => curve.game === host.dataset.of && curve.metrics[metric] && matches(curve));
-  const points = told.flatMap((curve) => {
-    const [steps, values] = curve.metrics[metric];
-    return steps.map((step, k) => ({
-      step, value: values[k], run: curve.run, recipe: curve.recipe || `${curve.operator} / ${curve.activation}`,
-      tip: `${curve.run}\nstep ${step}: ${values[k]}`,
-    }));
-  });
+  const points = told.flatMap(({ run, recipe, metrics }) =>
+    metrics[metric].map(([step, value]) => ({ run, recipe, step, value })),
+  );
   const scale = points.length && points.every((point) => point.value > 0) ? "log" : "linear";
   draw(host, scale, { points }, {}, "canvas");
 }

@@ -1,0 +1,96 @@
+"""The commands as Python calls: `hno.train` and `hno.evaluate`."""
+
+from __future__ import annotations
+
+import tempfile
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from hno.cli.arguments import Arguments
+from hno.cli.build import check
+from hno.cli.config import compose, for_hydra, groups, quoted, register_plugins
+from hno.cli.evaluate import check as check_evaluation
+from hno.cli.evaluate import checkpoints_of, evaluate_models
+from hno.cli.results import Results
+from hno.cli.train import train_operator
+from hno.games import Game, games
+from hno.training.checkpoint import LearnedPolicy, load_policy
+
+
+def train(
+    game: str | Game,
+    method: str = "sno",
+    folder: str | Path = "outputs/python",
+    settings: Mapping[str, Any] | None = None,
+) -> LearnedPolicy:
+    """Solve labels and train an operator, as `hno train` does, without its evaluation.
+
+    Args:
+        game: a registered name, or a game of a registered class.
+        method: a list of loss terms, such as "hno" or "sno"; `hno list method` lists them.
+        folder: where checkpoints and metrics go.
+        settings: keys of `hno train --help` and their values, such as {"trainer.max_steps": 500, "activation": "tanh"}.
+
+    Returns:
+        The policy of the best checkpoint, or of the last one where validation did not play.
+
+    Raises:
+        ValueError, LookupError: settings that are unknown or make no sense.
+        DivergedError: the loss, or the error on held-out labels, is no longer sound.
+    """
+    name = game if isinstance(game, str) else games.name_of(type(game))
+    constants = {} if isinstance(game, str) else {f"game.constants.{k}": v for k, v in game.constants.items()}
+    chosen = {"logger": "csv", "game": name, "operator": method, **constants, **(settings or {})}
+    register_plugins()
+    checked = check(compose("train", for_hydra("train", _arguments("train", chosen))))
+    place = Path(folder)
+    place.mkdir(parents=True, exist_ok=True)
+    warnings.filterwarnings("ignore", message=".*exists and is not empty")  # results.json is there first
+    fitted = train_operator(checked, place, Results(place / "results.json", {"game": name, "operator": method}))
+    return load_policy(fitted.checkpoint)
+
+
+def evaluate(
+    checkpoint: str | Path, folder: str | Path | None = None, settings: Mapping[str, Any] | None = None
+) -> dict[str, Any]:
+    """Evaluate a trained operator in closed loop, as `hno evaluate` does.
+
+    Args:
+        checkpoint: a checkpoint, or the folder of a run.
+        folder: where results.json, episodes and a picture go; they are not kept by default.
+        settings: keys of `hno evaluate --help` and their values, such as {"theta": "grid5", "starts": 50}.
+
+    Returns:
+        The content of results.json: `table` has the rows of `hno.evaluation.closed_loop`, one for each type.
+
+    Raises:
+        ValueError, LookupError: settings that are unknown or make no sense.
+        CheckpointError: a checkpoint that cannot be read.
+    """
+    chosen = {"checkpoint": str(checkpoint), **(settings or {})}
+    register_plugins()
+    checked = check_evaluation(compose("evaluate", for_hydra("evaluate", _arguments("evaluate", chosen))))
+    with tempfile.TemporaryDirectory() as nowhere:
+        place = Path(nowhere if folder is None else folder)
+        place.mkdir(parents=True, exist_ok=True)
+        results = Results(place / "results.json", {"checkpoint": str(checkpoint)})
+        evaluate_models(checked, list(map(str, checkpoints_of(checked))), results)
+    return results.content
+
+
+def _arguments(name: str, settings: Mapping[str, Any]) -> Arguments:
+    composed = groups(name)
+    return Arguments([], [f"{k}={v if k in composed else _text(v)}" for k, v in settings.items()], {})
+
+
+def _text(value: Any) -> str:
+    """A value in Hydra's grammar."""
+    if isinstance(value, Mapping):
+        return "{" + ",".join(f"{key}:{_text(entry)}" for key, entry in value.items()) + "}"
+    if isinstance(value, (list, tuple)):
+        return "[" + ",".join(map(_text, value)) + "]"
+    if value is None or isinstance(value, bool):
+        return "null" if value is None else str(value).lower()
+    return quoted(str(value)) if isinstance(value, (str, Path)) else repr(value)

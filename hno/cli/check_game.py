@@ -1,0 +1,61 @@
+"""`hno check-game`: whether a game keeps the contract."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from pathlib import Path
+from typing import Any
+
+from hno.cli.arguments import Arguments, UsageError
+from hno.cli.logs import use_threads
+from hno.registry import UnknownNameError
+
+PREFIX = "game.constants."
+
+
+def run(given: Arguments) -> int:
+    """`hno check-game NAME|MODULE:CLASS`."""
+    if len(given.words) != 1:
+        raise UsageError("Name one game: a registered name, or module:Class of a file in this folder.")
+    from hno.games.testing import ContractError, check_game
+
+    use_threads(1)
+    name, constants = given.words[0], _constants(given.overrides)
+    try:
+        game = _game(name, constants)
+        check_game(game)
+    except (ContractError, LookupError, ValueError, ImportError, TypeError) as error:
+        print(f"{name} cannot be used yet: {error}", file=sys.stderr)
+        return 1
+    print(
+        f"{name} keeps the contract of a game: {game.players} players, {game.state_dim} states and "
+        f"{game.control_dim} controls each, {game.horizon:g} s."
+    )
+    return 0
+
+
+def _game(name: str, constants: dict[str, Any]) -> Any:
+    from hno.games import Game, make
+
+    module, colon, cls = name.partition(":")
+    if not colon:
+        return make(name, **constants)
+    sys.path.insert(0, str(Path.cwd()))
+    try:
+        found = getattr(importlib.import_module(module), cls, None)
+    finally:
+        sys.path.remove(str(Path.cwd()))
+    if not (isinstance(found, type) and issubclass(found, Game)):
+        raise UnknownNameError(f"{module} has no class {cls!r} that is a Game.")
+    return found(**constants)
+
+
+def _constants(overrides: list[str]) -> dict[str, Any]:
+    from omegaconf import OmegaConf
+
+    wrong = [override for override in overrides if not override.lstrip("+").startswith(PREFIX)]
+    if wrong:
+        raise UsageError(f"{wrong[0]}: a game takes {PREFIX}<name>=<value> only.")
+    given = OmegaConf.from_dotlist([override.lstrip("+").removeprefix(PREFIX) for override in overrides])
+    return {str(name): value for name, value in (OmegaConf.to_object(given) or {}).items()}  # type: ignore[union-attr]

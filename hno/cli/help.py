@@ -1,0 +1,68 @@
+"""The help of commands that have a configuration: what can be chosen, and every key with its comment."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml  # type: ignore[import-untyped]  # yaml has no annotations
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
+from omegaconf import OmegaConf
+
+from hno.cli.arguments import Arguments
+from hno.cli.config import choices, comments, compose, config_dir, for_hydra, groups, heading
+
+BESIDE = 44
+"""The column of comments."""
+
+
+def configuration_help(name: str, given: Arguments) -> str:
+    """Groups with their choices, and the keys of the configuration that the overrides compose."""
+    overrides = for_hydra(name, given)
+    try:
+        config = compose(name, overrides)
+    except HydraException:  # values of a sweep, or mistakes of which a run will speak
+        config = compose(name, [])
+    said = dict(comments((config_dir() / f"{name}.yaml").read_text(encoding="utf-8")))
+    parts = []
+    for group in groups(name):
+        known = choices(group)
+        chosen = HydraConfig.get().runtime.choices.get(group)
+        parts.append(_group(group, known, chosen))
+        path = known.get(str(chosen))
+        if path is not None:
+            text = path.read_text(encoding="utf-8")
+            prefix = "" if "@package _global_" in text else f"{group}."
+            said.update({prefix + key: comment for key, comment in comments(text)})
+    head = "Groups, group=choice (*: chosen)\n" + "\n".join(parts) + "\n\n" if parts else ""
+    content: Any = OmegaConf.to_container(config, resolve=False)
+    return head + "Keys, key=value\n" + "\n".join(_keys(content, said))
+
+
+def _group(group: str, known: Mapping[str, Path | None], chosen: object) -> str:
+    lines = []
+    for place, (choice, path) in enumerate(known.items()):
+        mark = "*" if choice == chosen else " "
+        text = f"  {'' if place else group:<12}{mark}{choice:<16}{'' if path is None else heading(path)}"
+        lines.append(text.rstrip())
+    return "\n".join(lines)
+
+
+def _keys(content: Mapping[str, Any], said: Mapping[str, str], above: tuple[str, ...] = ()) -> Iterator[str]:
+    for key, value in content.items():
+        path = (*above, str(key))
+        nested = isinstance(value, Mapping) and value
+        text = f"{'  ' * len(path)}{key}: {'' if nested else _flow(value)}".rstrip()
+        comment = said.get(".".join(path))
+        yield text if comment is None else f"{text:<{BESIDE - 2}}  # {comment}"
+        if nested:
+            yield from _keys(value, said, path)
+
+
+def _flow(value: object) -> str:
+    if value == "???":
+        return "(required)"
+    text = yaml.safe_dump(value, default_flow_style=True, width=10**6, sort_keys=False)
+    return str(text).removesuffix("\n").removesuffix("\n...")

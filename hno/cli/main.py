@@ -1,0 +1,148 @@
+"""`hno`: one command line for everything. Nothing heavy is imported before a command needs it."""
+
+from __future__ import annotations
+
+import pkgutil
+import sys
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import hno
+from hno.cli.arguments import Arguments, UsageError, parse
+from hno.registry import unknown_name
+
+
+class Command(NamedTuple):
+    """One of the commands."""
+
+    run: str
+    """Where its function lies, (Arguments) -> exit code."""
+    usage: str
+    """Words after its name."""
+    about: str
+    """What it does; the first sentence stands in the list of commands."""
+    config: str | None = None
+    """Its root configuration, if it has one."""
+    word: str | None = None
+    """What a word without a flag or = sets."""
+    to: tuple[str, ...] = ()
+    """Keys that --to sets."""
+    flags: tuple[str, ...] = ()
+    """Flags besides --help and --version."""
+
+
+JOBS = (
+    "--dry-run", "--to", "--multirun", "--config-dir", "--cfg", "--package", "--info", "--resolve", "--hydra-help",
+    "--shell-completion",
+)  # fmt: skip
+FOLDERS = ("hydra.run.dir", "hydra.sweep.dir")
+FLAGS = {
+    "--dry-run": "print the configuration (with -m: the jobs) after it has been checked, and end",
+    "--to": "PATH: where results go",
+    "--multirun": "(or -m) run every combination of values that are separated by commas; anywhere on the line",
+    "--config-dir": "FOLDER: choices of your own, such as FOLDER/experiment/mine.yaml",
+    "--help": "this text",
+    "--version": "hno's version",
+}
+COMMANDS = {
+    "train": Command(
+        "hno.cli.train:run", "[group=choice ...] [key=value ...] [-m]",
+        "Solve labels, train an operator and evaluate it. The run's folder gets checkpoints, metrics and results.json.",
+        "train", to=FOLDERS, flags=JOBS,
+    ),
+    "evaluate": Command(
+        "hno.cli.evaluate:run", "checkpoint=FILE [key=value ...] [-m]",
+        "Evaluate checkpoints. How often they collide, where they err, and how they compare on the same starts.",
+        "evaluate", "checkpoint", FOLDERS, JOBS,
+    ),
+    "labels": Command(
+        "hno.cli.labels:run", "game=NAME theta=TYPES n=STARTS [key=value ...]",
+        "Solve open-loop equilibria and keep them with their certificates. What was stopped goes on where it was.",
+        "labels", to=("cache",), flags=("--dry-run", "--to", "--config-dir"),
+    ),
+    "report": Command(
+        "hno.cli.pages:run", "FOLDER [key=value ...]",
+        "Write a page about a run or a sweep, or figures for documents.",
+        "report", "folder", ("to",), ("--dry-run", "--to"),
+    ),
+    "list": Command(
+        "hno.cli.listing:run", "[KIND ...]",
+        "List what is registered: games, methods, networks, activations, losses, sources and optimizers, each with the "
+        "package that it comes from.",
+    ),
+    "new-game": Command(
+        "hno.cli.new_game:run", "NAME [--to FOLDER]",
+        "Write a small working game as a package of its own, with its configuration and its test.",
+        flags=("--to",),
+    ),
+    "check-game": Command(
+        "hno.cli.check_game:run", "NAME|MODULE:CLASS [game.constants.NAME=VALUE ...]",
+        "Check a game, and say in plain words what is wrong with it. The exit code is 0 if nothing is.",
+    ),
+}  # fmt: skip
+
+
+def main(given: Sequence[str] | None = None, prog: str | None = None) -> int:
+    """Entry point.
+
+    Args:
+        given: the words after the program's name; those of the process by default.
+        prog: how the command was called, for its help.
+
+    Returns:
+        The exit code.
+    """
+    name, *rest = [*(sys.argv[1:] if given is None else given)] or ["--help"]
+    if name in ("-h", "--help", "help", "--version"):
+        print(f"hno {hno.__version__}" if name == "--version" else _overview())
+        return 0
+    try:
+        if name not in COMMANDS:
+            raise UsageError(unknown_name("command", name, list(COMMANDS)))
+        return _run(COMMANDS[name], parse(rest), prog or f"hno {name}")
+    except UsageError as error:
+        print(error, file=sys.stderr)
+        return 2
+
+
+def _run(command: Command, given: Arguments, prog: str) -> int:
+    if "--version" in given.flags:
+        print(f"hno {hno.__version__}")
+        return 0
+    refused = [flag for flag in given.flags if flag not in (*command.flags, "--help")]
+    if refused:
+        raise UsageError(f"{prog} takes no {refused[0]}; its flags are {', '.join((*command.flags, '--help'))}.")
+    if "--help" in given.flags:
+        print(_help(command, given, prog))
+        return 0
+    return int(pkgutil.resolve_name(command.run)(_configured(command, given, prog)))
+
+
+def _configured(command: Command, given: Arguments, prog: str) -> Arguments:
+    """A bare word and --to as the overrides that they stand for, where the command has a configuration."""
+    if command.config is None:
+        return given
+    from hno.cli.config import quoted
+
+    if len(given.words) > (command.word is not None):
+        raise UsageError(f"{prog}: what is {given.words[-1]!r}? Usage: {prog} {command.usage}")
+    stands_for = [f"{command.word}={quoted(word)}" for word in given.words]
+    stands_for += [f"{key}={quoted(given.flags['--to'])}" for key in command.to if "--to" in given.flags]
+    return given._replace(words=[], overrides=[*given.overrides, *stands_for])
+
+
+def _overview() -> str:
+    lines = ["Usage: hno COMMAND ...", ""]
+    lines += [f"  {name:<12}{command.about.split('. ')[0].rstrip('.')}" for name, command in COMMANDS.items()]
+    return "\n".join([*lines, "", "hno COMMAND --help says more; hno --version prints the version."])
+
+
+def _help(command: Command, given: Arguments, prog: str) -> str:
+    shown = [flag for flag in FLAGS if flag in (*command.flags, "--help", "--version")]
+    flags = [f"  {flag:<14}{FLAGS[flag]}" for flag in shown]
+    parts = [f"Usage: {prog} {command.usage}", command.about, "\n".join(["Flags", *flags])]
+    if command.config is not None:
+        from hno.cli.help import configuration_help
+
+        parts.append(configuration_help(command.config, given))
+    return "\n\n".join(parts)

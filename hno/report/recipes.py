@@ -1,0 +1,245 @@
+"""Runs that differ in their seed only as one recipe: pooled counts, the spread over seeds, and the best of a game."""
+
+from __future__ import annotations
+
+import functools
+import math
+import statistics
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from scipy.stats import t as student
+
+from hno.evaluation.closed_loop import TypeRow
+from hno.evaluation.format import NOT_AVAILABLE
+from hno.evaluation.metrics import clopper_pearson
+from hno.evaluation.outcome import Pooled, pooled
+from hno.report.records import Run
+
+IGNORED = ("seed", "resume", "cache", "workers", "data.cache", "data.workers", "trainer.print_every", "trainer.threads")
+"""Settings that do not make another recipe."""
+SHOWN = 3
+"""Differing settings that are named in a recipe's label."""
+Comparable = tuple[str, str, frozenset[tuple[float, ...]]]
+"""What recipes share whose numbers may be compared: game, changed constants and conditions of play, and types."""
+
+interval = functools.cache(clopper_pearson)
+
+
+class Spread(NamedTuple):
+    """A number over seeds."""
+
+    mean: float
+    interval: tuple[float, float] | None
+    """Student's 95 % interval of the mean; None for one seed."""
+    low: float
+    high: float
+    seeds: int
+
+
+def spread(values: Iterable[float | None]) -> Spread | None:
+    """Mean, interval and range of the numbers that exist; None if there are none."""
+    found = [value for value in values if value is not None]
+    if not found:
+        return None
+    mean, count = math.fsum(found) / len(found), len(found)
+    bounds = None
+    if count > 1:
+        half = float(student.ppf(0.975, count - 1)) * statistics.stdev(found) / math.sqrt(count)
+        bounds = (mean - half, mean + half)
+    return Spread(mean, bounds, min(found), max(found), count)
+
+
+class TypeCounts(NamedTuple):
+    """One type over one or several seeds."""
+
+    theta: tuple[float, ...]
+    seen: bool
+    """Whether the operator was trained with labels of these types."""
+    extrapolated: bool
+    """Whether the types lie outside the range that the game is made for."""
+    collisions: int
+    safe_starts: int
+    rate: float | None
+    """Collisions per safe start."""
+    interval: tuple[float, float] | None
+    """Clopper-Pearson 95 % interval of the rate."""
+    relative_excess: float | None
+    """Median over seeds of (median joint cost above the equilibrium's) / (median of the equilibrium's)."""
+
+
+def by_type(rows: Iterable[TypeRow]) -> list[TypeCounts]:
+    """Rows of one or several tables as one line per type, counts pooled."""
+    groups: dict[tuple[float, ...], list[TypeRow]] = {}
+    for row in rows:
+        groups.setdefault(row.theta, []).append(row)
+    return [_together(theta, same) for theta, same in sorted(groups.items())]
+
+
+def _together(theta: tuple[float, ...], same: Sequence[TypeRow]) -> TypeCounts:
+    hits, starts = (sum(getattr(row.outcome, name) for row in same) for name in ("collisions", "safe_starts"))
+    costs = [(row.outcome.median_excess_cost, row.outcome.median_label_cost) for row in same]
+    ratios = [above / abs(cost) for above, cost in costs if above is not None and cost]
+    return TypeCounts(
+        theta, any(row.seen for row in same), any(row.extrapolated for row in same), hits, starts,
+        hits / starts if starts else None, interval(hits, starts), statistics.median(ratios) if ratios else None,
+    )  # fmt: skip
+
+
+def pool(rows: Iterable[TypeRow]) -> Pooled:
+    """Rows of one or several tables in one line."""
+    return pooled([row.content() for row in rows])
+
+
+@dataclass(frozen=True, eq=False)
+class Recipe:
+    """Runs that differ in their seed only."""
+
+    game: str
+    operator: str
+    activation: str
+    variant: str
+    """Settings in which it differs from others of the same names; empty if there are none."""
+    special: str
+    """Changed constants of the game and how episodes were played, as far as that is not usual; empty if it is."""
+    runs: tuple[Run, ...]
+    """One finished run for every seed."""
+    repeated: tuple[Run, ...]
+    """Finished runs of a seed that a later run repeats; they do not count."""
+    unfinished: int
+    failed: int
+
+    @property
+    def name(self) -> str:
+        """Operator, activation and what else is special."""
+        return " / ".join(filter(None, (self.operator, self.activation, self.variant)))
+
+    @property
+    def conditions(self) -> str:
+        """At how many types episodes were played, and what was special."""
+        sizes = sorted({len(run.table) for run in self.runs})
+        at = f"{' or '.join(map(str, sizes))} types" if sizes else NOT_AVAILABLE
+        return ", ".join(filter(None, (at, self.special)))
+
+    @property
+    def comparable(self) -> Comparable:
+        """Equal for recipes whose numbers may be compared."""
+        return self.game, self.special, frozenset(row.theta for run in self.runs for row in run.table)
+
+    @functools.cached_property
+    def types(self) -> list[TypeCounts]:
+        """One line per type over all seeds."""
+        return by_type(row for run in self.runs for row in run.table)
+
+    @functools.cached_property
+    def by_seed(self) -> list[Pooled]:
+        """One line per run, over all types."""
+        return [pool(run.table) for run in self.runs]
+
+    @functools.cached_property
+    def pooled(self) -> Pooled:
+        """Counts over all types and seeds; the worst type is that of the pooled counts."""
+        return pooled([counts._asdict() for counts in self.types])
+
+    @property
+    def rates(self) -> Spread | None:
+        """Collision rate over seeds."""
+        return spread(one.rate for one in self.by_seed)
+
+    @property
+    def excess(self) -> Spread | None:
+        """Relative excess cost over seeds."""
+        return spread(one.relative_excess for one in self.by_seed)
+
+    def seconds(self, stage: str) -> Spread | None:
+        """Time that a stage took over seeds, s; "total" is the sum of all."""
+        return spread(seconds(run, stage) for run in self.runs)
+
+
+def seconds(run: Run, stage: str) -> float | None:
+    """Time that a stage of a run took, s; "total" is the sum of all."""
+    if stage == "total":
+        return math.fsum(run.seconds.values()) if run.seconds else None
+    return run.seconds.get(stage)
+
+
+def recipes(runs: Sequence[Run]) -> list[Recipe]:
+    """Group runs whose settings are equal but for the seed."""
+    groups: dict[tuple[str, ...], dict[tuple[tuple[str, str], ...], list[Run]]] = {}
+    for run in runs:
+        names = (run.game, run.operator, run.activation)
+        groups.setdefault(names, {}).setdefault(tuple(sorted(_relevant(run).items())), []).append(run)
+    return [
+        _recipe(names, variant, same)
+        for names, group in sorted(groups.items())
+        for variant, same in zip(_variants([dict(key) for key in group]), group.values(), strict=True)
+    ]
+
+
+def _relevant(run: Run) -> dict[str, str]:
+    """The settings that make a recipe; without a configuration, what the results say."""
+    chosen = {key: text for key, text in run.settings.items() if key not in IGNORED and not key.startswith("logger.")}
+    return chosen or {"steps": str(run.steps or NOT_AVAILABLE), "conditions": run.conditions}
+
+
+def _variants(settings: Sequence[Mapping[str, str]]) -> list[str]:
+    """What tells each of some settings from the others."""
+    keys = sorted({key for one in settings for key in one})
+    differing = [key for key in keys if len({one.get(key) for one in settings}) > 1]
+    more = [f"{len(differing) - SHOWN} more"] if len(differing) > SHOWN else []
+    return [", ".join([f"{key}={_short(one.get(key))}" for key in differing[:SHOWN]] + more) for one in settings]
+
+
+def _short(text: str | None) -> str:
+    """A setting for a label: the last three names of a path, the beginning of anything else."""
+    if text is None:
+        return NOT_AVAILABLE
+    return "/".join(text.split("/")[-3:]) if "/" in text else text[:40]
+
+
+def _recipe(names: tuple[str, ...], variant: str, runs: Sequence[Run]) -> Recipe:
+    last = {(run.seed, run.test_seed): run for run in runs if run.finished}
+    counted = tuple(last.values())
+    repeated = tuple(run for run in runs if run.finished and all(run is not other for other in counted))
+    failed = sum(run.status == "failed" for run in runs)
+    unfinished = len(runs) - len(counted) - len(repeated) - failed
+    special = ", ".join(sorted({text for run in counted for text in (_constants(run), run.conditions)} - {""}))
+    game, operator, activation = names
+    return Recipe(game, operator, activation, variant, special, counted, repeated, unfinished, failed)
+
+
+def _constants(run: Run) -> str:
+    changed = {key: text for key, text in sorted(run.settings.items()) if key.startswith("game.constants.")}
+    return ", ".join(f"{key.removeprefix('game.constants.')} {text}" for key, text in changed.items())
+
+
+def best(found: Iterable[Recipe]) -> dict[Comparable, Recipe]:
+    """The recipe with the lowest collision rate, then the lowest excess cost, of all that may be compared."""
+    chosen: dict[Comparable, Recipe] = {}
+    for recipe in sorted((one for one in found if one.pooled.safe_starts), key=_order):
+        chosen.setdefault(recipe.comparable, recipe)
+    return chosen
+
+
+def _order(recipe: Recipe) -> tuple[float, float]:
+    return recipe.pooled.rate or 0.0, math.inf if recipe.excess is None else recipe.excess.mean
+
+
+def headline(found: Iterable[Recipe]) -> Recipe:
+    """Of the best recipes of a game the one at its usual constants and conditions, then at the most types."""
+    return min(found, key=lambda one: (bool(one.special), -len(one.comparable[2]), *_order(one)))
+
+
+def rivals(chosen: Recipe, found: Iterable[Recipe]) -> list[Recipe]:
+    """Recipes that may be compared with the chosen one and whose interval of the collision rate overlaps its own."""
+    bounds = chosen.pooled.interval
+    assert bounds is not None
+    return [
+        other
+        for other in found
+        if other is not chosen
+        and other.comparable == chosen.comparable
+        and other.pooled.interval is not None
+        and other.pooled.interval[0] <= bounds[1]
+    ]

@@ -1,0 +1,105 @@
+"""Judgements and other sentences of a report."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from hno.evaluation.format import NOT_AVAILABLE, counted, interval, percent, signed, types
+from hno.evaluation.outcome import Pooled
+from hno.report.episode import Episode
+from hno.report.recipes import Recipe, Spread, best, rivals
+from hno.report.records import Run
+from hno.report.runs import Sweep
+
+
+def share(found: Pooled) -> str:
+    """Collisions of starts, in short."""
+    return f"{found.collisions:,} of {found.safe_starts:,}: {percent(found.rate)}"
+
+
+def rate(found: Pooled) -> str:
+    """Collisions of starts, with everything needed to judge them."""
+    if not found.safe_starts:
+        return f"no safe start, collision rate {NOT_AVAILABLE}"
+    counts = f"{counted(found.collisions, 'collision')} in {counted(found.safe_starts, 'safe start')}"
+    return f"{counts} ({percent(found.rate)}, 95 % interval {interval(found.interval)})"
+
+
+def at(theta: Sequence[float]) -> str:
+    """Player types."""
+    return f"({types(theta)})"
+
+
+def clearance(found: Episode, unit: str) -> str:
+    """How close an episode came; for distances, to the collision radius."""
+    if found.clearance is None:
+        return f"clearance {NOT_AVAILABLE}"
+    if found.radius is None:
+        return f"clearance {found.clearance:.2f} {unit}".strip()
+    return f"{abs(found.clearance):.2f} m {'short of' if found.clearance > 0 else 'inside'} the collision radius"
+
+
+def over_seeds(found: Spread | None) -> str:
+    """Mean with its interval, or that there is one seed only."""
+    if found is None:
+        return NOT_AVAILABLE
+    if found.interval is None:
+        return f"{signed(found.mean)} (one seed)"
+    low, high = found.interval
+    return f"{signed(found.mean)} ({signed(low)} to {signed(high)}, {found.seeds} seeds)"
+
+
+def seeds(recipe: Recipe) -> str:
+    """How many seeds count."""
+    return counted(len(recipe.runs), "seed")
+
+
+def jobs(sweep: Sweep) -> str:
+    """How many jobs ended how."""
+    finished = sum(run.finished for run in sweep.runs)
+    failed = sum(run.status == "failed" for run in sweep.runs)
+    waiting = (sweep.planned or 0) - len(sweep.runs) - len(sweep.skipped)
+    counts = {"failed": failed, "unfinished": len(sweep.runs) - finished - failed, "not begun": waiting}
+    said = [f"{finished} finished", *(f"{count} {state}" for state, count in counts.items() if count > 0)]
+    said += [f"{counted(len(sweep.skipped), 'folder')} skipped"] if sweep.skipped else []
+    return f"{counted(len(sweep.runs), 'run')}: {', '.join(said)}."
+
+
+def quality(found: Pooled) -> str:
+    """One word of judgement: "safe" (nothing collided), "rare" (at most 1 %), "unsafe" or "unknown"."""
+    if found.rate is None:
+        return "unknown"
+    return "safe" if found.collisions == 0 else ("rare" if found.rate <= 0.01 else "unsafe")
+
+
+def verdicts(recipes: Sequence[Recipe]) -> list[tuple[Recipe, str]]:
+    """The best recipes with a judgement, for every game and conditions of play."""
+    chosen = sorted(best(recipes).values(), key=lambda recipe: recipe.game)
+    return [(recipe, _verdict(recipe, recipes)) for recipe in chosen]
+
+
+def _verdict(recipe: Recipe, recipes: Sequence[Recipe]) -> str:
+    whole = recipe.pooled
+    judged = {"safe": "No start collides", "rare": "Collisions are rare", "unsafe": "Not safe"}[quality(whole)]
+    worst = ""
+    if whole.worst_theta is not None:
+        (counts,) = (one for one in recipe.types if one.theta == whole.worst_theta)
+        worst = f" Worst type {at(counts.theta)}: {counts.collisions} of {counts.safe_starts:,}."
+    others = [other.name for other in rivals(recipe, recipes)]
+    rest = f" Not told apart from {_list(others)}: the intervals overlap." if others else ""
+    return (
+        f"{judged} ({seeds(recipe)}, {recipe.conditions}): 95 % interval {interval(whole.interval)}.{worst} "
+        f"Joint cost above the equilibrium's: {over_seeds(recipe.excess)}.{rest}"
+    )
+
+
+def _list(names: Sequence[str], shown: int = 3) -> str:
+    more = f" and {len(names) - shown} more" if len(names) > shown else ""
+    return ", ".join(names[:shown]) + more
+
+
+def why(run: Run) -> str:
+    """Why a run has no result."""
+    if run.status == "failed":
+        return run.reason or "failed without a reason"
+    return f"unfinished: its results say {run.status!r}. It is still at work, or was killed."

@@ -1,0 +1,36 @@
+"""Commands as Python calls."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+import hno
+from hno.games import make
+
+TINY = {
+    "experiment": "smoke", "data.types": [[1, 1]], "data.workers": 1, "evaluation.dt": 0.1, "trainer.max_steps": 2,
+}  # fmt: skip
+
+
+@pytest.mark.usefixtures("cache", "clean_globals")
+def test_training_and_evaluation_as_calls(tmp_path: Path) -> None:
+    policy = hno.train("narrow_road", "hno", tmp_path / "run", {**TINY, "activation": "tanh"})
+    assert policy.names() == {"game": "narrow_road", "operator": "hno", "activation": "tanh"}
+    tau, theta = torch.tensor([3.0]), torch.ones(1, 2)
+    x = policy.game.initial_box.sample(1, torch.Generator().manual_seed(0))
+    assert policy.value(tau, x, theta).shape == (1, 2)
+    settings = {"theta": "1,1", "starts": 4, "workers": 1, "dt": 0.1, "residuals": False}
+    found = hno.evaluate(tmp_path / "run", settings=settings)
+    assert found["status"] == "finished"
+    assert [row["theta"] for row in found["table"]] == [(1.0, 1.0)]
+
+
+@pytest.mark.usefixtures("no_labels")
+def test_a_game_keeps_its_constants_and_mistakes_are_errors(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"trainer\.max_step does not exist"):
+        hno.train(make("narrow_road", radius=1.5), "hno", tmp_path, {**TINY, "trainer.max_step": 3})
+    with pytest.raises(AssertionError, match="labels were asked for"):
+        hno.train(make("narrow_road", radius=1.5), "hno", tmp_path, TINY)

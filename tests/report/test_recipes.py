@@ -1,0 +1,182 @@
+"""Pooled counts and spreads over seeds, against the formulas written out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import beta, t
+
+from hno.evaluation.closed_loop import TypeRow
+from hno.report.page_data import cells
+from hno.report.recipes import Recipe, best, by_type, headline, pool, recipes, rivals, spread
+from hno.report.records import Run, type_row
+from hno.report.runs import load
+from hno.report.tables import recipe_table
+from tests.report.folders import make_results, row, write_run
+
+FIRST, SECOND = (1.0, 1.0), (5.0, 5.0)
+
+
+def result(theta: tuple[float, ...], collisions: int, starts: int, excess_cost: float | None = None) -> TypeRow:
+    return type_row(row(theta, collisions, starts) | {"median_excess_cost": excess_cost, "median_label_cost": 10.0})
+
+
+def write(folder: Path, seed: int, collisions: Sequence[int], **entries: Any) -> None:
+    names = {"game": "drone", "operator": "sno", "activation": "tanh"} | entries
+    table = [row(theta, count, 100) for theta, count in zip((FIRST, SECOND), collisions, strict=True)]
+    results = {"status": "finished", "reason": None, "seed": seed, "seconds": {"labels": 1.0 + seed}}
+    results |= {"config": {"operator": names["operator"], "seed": seed}, "table": table, "episodes": None} | names
+    write_run(folder, results, extras=False)
+
+
+def loaded(folder: Path) -> tuple[Run, ...]:
+    return load(folder).runs
+
+
+@given(starts=st.integers(1, 400), share=st.floats(0, 1))
+def test_the_interval_is_clopper_pearson(starts, share):
+    hits = round(share * starts)
+    ((*_, (low, high), _),) = by_type([result(FIRST, hits, starts)])
+    assert low == pytest.approx(beta.ppf(0.025, hits, starts - hits + 1) if hits else 0.0)
+    assert high == pytest.approx(beta.ppf(0.975, hits + 1, starts - hits) if hits < starts else 1.0)
+
+
+@given(st.lists(st.floats(-5, 5), min_size=2, max_size=8))
+def test_the_spread_is_students(values):
+    count, found = len(values), spread(values)
+    centre = sum(values) / count
+    deviation = math.sqrt(sum((value - centre) ** 2 for value in values) / (count - 1))
+    assert found.mean == pytest.approx(centre, abs=1e-12)
+    half = t.ppf(0.975, count - 1) * deviation / math.sqrt(count)
+    assert found.interval == pytest.approx((centre - half, centre + half), abs=1e-9)
+    assert (found.low, found.high, found.seeds) == (min(values), max(values), count)
+
+
+def test_nothing_is_not_zero():
+    assert spread([None, None]) is None
+    assert spread([None, 3.0]) == (3.0, None, 3.0, 3.0, 1)
+    (counts,) = by_type([result(FIRST, 0, 0)])
+    assert (counts.rate, counts.interval, counts.relative_excess) == (None, None, None)
+
+
+def test_types_outside_the_box_stay_marked_over_seeds_and_on_the_page():
+    inside, outside = (
+        type_row(row(theta, 1) | {"extrapolated": flag}) for theta, flag in ((FIRST, False), (SECOND, True))
+    )
+    assert [cell["extrapolated"] for cell in cells(by_type([inside, outside, outside]))] == [False, True]
+
+
+@pytest.mark.parametrize(
+    ("counts", "shown"), [([(0, 0)], "n/a"), ([(0, 9), (0, 9)], "none"), ([(0, 9), (1, 10)], "(5, 5) 10.00 %")]
+)
+def test_where_nothing_collided_no_type_is_the_worst(tmp_path, counts, shown):
+    table = [row(theta, *found) for theta, found in zip((FIRST, SECOND), counts, strict=False)]
+    write(tmp_path / "0", 0, (0, 0), table=table)
+    assert cell(tmp_path, "worst type") == shown
+
+
+def test_counts_are_pooled_and_other_numbers_averaged():
+    (pooled,) = by_type([result(FIRST, 1, 100, 2.0), result(FIRST, 4, 50, None), result(FIRST, 0, 50, 4.0)])
+    assert (pooled.collisions, pooled.safe_starts, pooled.relative_excess) == (5, 200, pytest.approx(0.3))
+
+
+def test_the_excess_of_a_run_is_the_median_over_types():
+    rows = [result((k, k), 0, 9, cost) for k, cost in enumerate((1.0, 2.0, 7.0))]
+    assert pool(rows).relative_excess == pytest.approx(0.2)
+
+
+def rate(recipe: Recipe) -> tuple[int, int]:
+    return recipe.pooled.collisions, recipe.pooled.safe_starts
+
+
+def cell(folder: Path, heading: str) -> str:
+    """Of the one line of the table of recipes."""
+    table = recipe_table(recipes(loaded(folder)))
+    (texts,) = table.texts
+    return texts[[column.title for column in table.columns].index(heading)]
+
+
+def test_seeds_of_one_recipe_are_one_line(tmp_path):
+    write(tmp_path / "0", 0, (0, 1))
+    write(tmp_path / "1", 1, (2, 5))
+    (recipe,) = recipes(loaded(tmp_path))
+    assert rate(recipe) == (8, 400)
+    assert [(entry.theta, entry.collisions, entry.safe_starts) for entry in recipe.types] == [
+        (FIRST, 2, 200),
+        (SECOND, 6, 200),
+    ]
+    assert (recipe.rates.low, recipe.rates.high) == (1 / 200, 7 / 200)
+    assert recipe.seconds("labels").mean == 1.5
+    assert recipe.variant == ""
+
+
+@pytest.mark.parametrize(("seeds", "shown"), [((0,), "cached"), ((0, 1), "5 (partly cached)"), ((1, 2), "15")])
+def test_labels_from_the_cache_are_said_to_be(tmp_path, seeds, shown):
+    for seed in seeds:
+        write(tmp_path / str(seed), seed, (0, 1), seconds={"labels": 10.0 * seed, "training": 50.0})
+    assert cell(tmp_path, "labels, s") == shown
+
+
+def test_another_setting_is_another_recipe_and_says_which(tmp_path):
+    for name, weight in (("0", 0.1), ("1", 0.2)):
+        write(tmp_path / name, 0, (0, 0), config={"loss": {"weight": weight}, "seed": 0, "data": {"cache": name}})
+    assert [recipe.variant for recipe in recipes(loaded(tmp_path))] == ["loss.weight=0.1", "loss.weight=0.2"]
+
+
+def test_the_same_seed_counts_once(tmp_path):
+    write(tmp_path / "0", 0, (50, 50))
+    write(tmp_path / "1", 0, (1, 1))
+    (recipe,) = recipes(loaded(tmp_path))
+    assert rate(recipe) == (2, 200)
+    assert [run.name for run in recipe.repeated] == ["0"]
+
+
+def test_failed_and_unfinished_runs_are_told_but_not_counted(tmp_path):
+    write(tmp_path / "0", 0, (1, 0))
+    write(tmp_path / "1", 1, (90, 90), status="failed", reason="diverged")
+    write(tmp_path / "2", 2, (90, 90), status="running")
+    (recipe,) = recipes(loaded(tmp_path))
+    assert (rate(recipe), recipe.failed, recipe.unfinished) == ((1, 200), 1, 1)
+
+
+def recipe_names(found: Sequence[Recipe]) -> list[str]:
+    return [recipe.operator for recipe in found]
+
+
+def test_the_best_has_the_lowest_rate_and_names_its_rivals(tmp_path):
+    for operator, collisions in (("sno", (0, 1)), ("hno", (0, 2)), ("other", (40, 60))):
+        write(tmp_path / operator, 0, collisions, operator=operator)
+    found = recipes(loaded(tmp_path))
+    (chosen,) = best(found).values()
+    assert chosen.operator == "sno"
+    assert recipe_names(rivals(chosen, found)) == ["hno"]
+
+
+def test_other_conditions_of_play_are_not_compared(tmp_path):
+    write(tmp_path / "0", 0, (5, 5))
+    write(tmp_path / "1", 0, (0, 0), operator="hno", noise=0.2)
+    write(tmp_path / "2", 0, (0, 0), operator="narrow", table=[row(FIRST, 0, 100)])
+    write(tmp_path / "3", 0, (0, 0), operator="elsewhere", table=[row(FIRST, 50, 100), row((2.0, 2.0), 0, 100)])
+    config = {"game": {"name": "drone", "constants": {"radius": 0.1}}, "seed": 0}
+    write(tmp_path / "4", 0, (0, 0), operator="easy", config=config)
+    found = recipes(loaded(tmp_path))
+    assert len(best(found)) == 5
+    assert rate(headline(best(found).values())) == (10, 200)
+    assert any("radius 0.1" in recipe.conditions for recipe in found)
+    assert all(rivals(chosen, found) == [] for chosen in best(found).values())
+
+
+def test_runs_without_a_configuration_are_told_apart_by_their_steps(tmp_path):
+    import numpy as np
+
+    for k, steps in enumerate((10, 20)):
+        results = make_results("drone", "sno", "tanh", 0, np.random.default_rng(0), [FIRST], steps=steps)
+        del results["config"]
+        write_run(tmp_path / str(k), results, extras=False)
+    assert [recipe.variant for recipe in recipes(loaded(tmp_path))] == ["steps=10", "steps=20"]
