@@ -70,7 +70,7 @@ def control_steps(game: Game, dt: float) -> int:
 
 def _played(
     game: Game,
-    policy: Policy,
+    policy: Player,
     x0: Tensor,
     theta: Tensor,
     dt: float,

@@ -22,6 +22,9 @@ LABELS = {"value": {}, "costate": {}}
 """The terms that compare with labels."""
 
 
+SMALL = Choice("deeponet", {"width": 32, "depth": 3})
+
+
 @pytest.fixture
 def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, dict[str, str]]:
     """The examples' package as `pip install ./examples` leaves it; its entry points by group.
@@ -71,7 +74,7 @@ def train(cache: Path, tmp_path: Path) -> Train:
         *,
         terms: Mapping[str, Mapping[str, Any]] = LABELS,
         weights: Mapping[str, float] | None = None,
-        network: Choice = Choice("deeponet", {"width": 32, "depth": 3}),
+        network: Choice = SMALL,
         sampler: Mapping[str, Any] | None = None,
         optimizer: Mapping[str, Any] | None = None,
         trajectories: int = 6,

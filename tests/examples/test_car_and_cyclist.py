@@ -1,11 +1,11 @@
 from __future__ import annotations
 
 import torch
+from hno_examples.car_and_cyclist import CarAndCyclist
 
 from hno.control import rollout
 from hno.control.policy import Feedback
 from hno.games.testing import check_game
-from hno_examples.car_and_cyclist import CarAndCyclist
 from tests.examples.conftest import Train
 
 
