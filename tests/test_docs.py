@@ -16,8 +16,8 @@ from typing import NamedTuple
 
 import pytest
 import torch
-from hno.cli.main import main
 
+from hno.cli.main import main
 from hno.games import make
 from hno.operators import Architecture, make_operator
 from hno.training.checkpoint import Provenance, record
