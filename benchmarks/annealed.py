@@ -1,89 +1,42 @@
-"""Operators whose HJI term sees a penalty that hardens during the hybrid phase, in the set "samplers" of recipes."""
+"""The HJI residual under a penalty that hardens while an operator trains, in the set "samplers" of recipes."""
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
-from typing import ClassVar
 
 from torch import Tensor
 
-from hno.games import Game
-from hno.losses import LossTerm
-from hno.losses.hji import Boundary, HJIResidual, hji_residual
-from hno.losses.supervised import CostateDeviation, ValueDeviation
-from hno.operators import ValueOperator, operators
-from hno.types import Batch, Field, Sample
-
-FIRST, LAST = 800, 1400
-"""Steps between which the penalty hardens: the first half of the hybrid phase of its recipes."""
-START = 0.05
-"""Share of the game's penalty at first."""
+from hno.losses import LossTerm, View, hji_residual, losses
+from hno.losses.hji import HJIResidual
 
 
-class _Annealed(LossTerm):
-    """The HJI residual with one constant of the penalty growing geometrically to the game's.
+@losses.register("annealed")
+class AnnealedResidual(LossTerm):
+    """The HJI residual with one constant of the penalty growing geometrically to the game's own.
 
     Its scale divides by the game's own penalty throughout.
+
+    Args:
+        constant: attribute of the game: "penalty_height" is low at first, "penalty_slope" flat, so that the penalty is
+            felt from afar.
+        start: share of the constant at first.
+        first: step at which it begins to grow.
+        last: step from which on it is the game's own.
     """
 
     stream = "interior"
-    constant: ClassVar[str]
-    """Attribute of the game."""
     scale = HJIResidual.scale
-    step: int = LAST
 
-    def residual(self, game: Game, sample: Sample, field: Field) -> Tensor:
+    def __init__(
+        self, constant: str = "penalty_height", start: float = 0.05, first: int = 800, last: int = 1400
+    ) -> None:
+        super().__init__()
+        self.constant, self.start, self.first, self.last = constant, start, first, last
+
+    def residual(self, view: View) -> Tensor:
         """(B, P), 1/s."""
-        done = (self.step - FIRST) / (LAST - FIRST)
-        share = START ** (1 - min(1.0, max(0.0, done)))
-        soft = copy.copy(game)
-        setattr(soft, self.constant, share * getattr(game, self.constant))
-        return hji_residual(soft, sample.points, field)
-
-
-class AnnealedHeight(_Annealed):
-    """Low at first."""
-
-    constant = "penalty_height"
-
-
-class AnnealedSlope(_Annealed):
-    """Flat at first, so that it is felt from afar."""
-
-    constant = "penalty_slope"
-
-
-class _AnnealedOperator(ValueOperator):
-    """HNO that tells its residual the step."""
-
-    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        """As of any operator."""
-        term = self.term("residual")
-        assert isinstance(term, _Annealed)
-        term.step = self.global_step
-        return super().training_step(batch, batch_idx)
-
-
-@operators.register("hno_annealed_height")
-class AnnealedHeightOperator(_AnnealedOperator):
-    """HNO with `AnnealedHeight`."""
-
-    terms: ClassVar[Mapping[str, type[LossTerm]]] = {
-        "value": ValueDeviation,
-        "costate": CostateDeviation,
-        "boundary": Boundary,
-        "residual": AnnealedHeight,
-    }
-
-
-@operators.register("hno_annealed_slope")
-class AnnealedSlopeOperator(_AnnealedOperator):
-    """HNO with `AnnealedSlope`."""
-
-    terms: ClassVar[Mapping[str, type[LossTerm]]] = {
-        "value": ValueDeviation,
-        "costate": CostateDeviation,
-        "boundary": Boundary,
-        "residual": AnnealedSlope,
-    }
+        done = (view.step - self.first) / (self.last - self.first)
+        share = self.start ** (1 - min(1.0, max(0.0, done)))
+        soft = copy.copy(view.game)
+        setattr(soft, self.constant, share * getattr(view.game, self.constant))
+        return hji_residual(soft, view.sample.points, view.field)

@@ -19,8 +19,9 @@ from recipe_sets import SUITES
 from recipes import starts
 from torch import Tensor
 
-from hno.control.rollout import Policy, rollout
+from hno.control.rollout import Player, rollout
 from hno.evaluation.metrics import clopper_pearson
+from hno.games import games
 from hno.operators import ValueOperator
 from hno.training.checkpoint import load_operator
 from hno.types import Field, Points
@@ -42,7 +43,7 @@ CHOICES: dict[str, Choice] = {
 }
 
 
-def together(operators: Sequence[ValueOperator], choice: Choice) -> Policy:
+def together(operators: Sequence[ValueOperator], choice: Choice) -> Player:
     """The policy of several operators."""
 
     def policy(tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
@@ -64,11 +65,11 @@ def main() -> None:
     size, folders = arguments.members, arguments.folders
     if not 1 <= size <= len(folders):
         raise SystemExit(f"--members must be from 1 to the number of folders, {len(folders)}; got {size}.")
-    nets = [load_operator(folder / "best.ckpt") for folder in folders]
+    nets = [load_operator(folder / "best.ckpt")[0] for folder in folders]
     groups = [nets[at : at + size] for at in range(0, len(nets) - size + 1, size)]
     everything = {}
     for suite in arguments.suites:
-        at, _ = starts(nets[0].names()["game"], suite)
+        at, _ = starts(games.name_of(type(nets[0].game)), suite)
         cases = {"alone": [together([net], CHOICES["median"]) for group in groups for net in group]}
         cases |= {name: [together(group, choice) for group in groups] for name, choice in CHOICES.items()}
         for name, policies in cases.items():

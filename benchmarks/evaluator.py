@@ -17,10 +17,10 @@ from collections.abc import Callable
 
 import torch
 
+from hno.control import Feedback
 from hno.control.rollout import rollout
 from hno.games import make
-from hno.operators import operators
-from hno.training.checkpoint import OperatorPolicy
+from hno.operators import make_operator
 
 
 def seconds(run: Callable[[], object]) -> float:
@@ -39,7 +39,7 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     game = make(arguments.game)
-    policy = OperatorPolicy(operators.get("hno")(game).eval().requires_grad_(False))
+    policy = Feedback(make_operator(game).eval().requires_grad_(False))
     types = torch.tensor(list(itertools.product(range(1, 6), repeat=2)), dtype=torch.float32)
     starts = game.initial_box.sample(len(types) * arguments.starts, torch.Generator().manual_seed(0))
     theta = types.repeat_interleave(arguments.starts, 0)

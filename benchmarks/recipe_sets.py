@@ -46,6 +46,7 @@ MOST = {"half types": 256, "beyond": 512, "1.5 x box": 256, "2 x box": 256}
 CORNERS = "data.types=[[1,1],[1,5],[5,1],[5,5]]"
 TO_THE_END = "data.pretrain=0.4 data.widening=0.3 data.finish=0"
 HNO = f"operator=hno {TO_THE_END}"
+HARDENING = f"{HNO} loss.terms.residual=null loss.weights.residual=null ++loss.weights.annealed=0.02"
 FINISHED = "operator=hno data.pretrain=0.2 data.widening=0.2 data.finish=0.4"
 LATE = "operator=hno data.pretrain=0.4 data.widening=0.2 data.finish=0.2"
 SHORT = "activation=tanh trainer.max_steps=1000"
@@ -111,7 +112,7 @@ RECIPES: dict[str, dict[str, str]] = {
         "huber": "loss.norm=huber",
         "costate 3": "loss.weights.costate=3",
         "batch 1024, twice the steps": "data.batch_sizes.bvp=1024 trainer.max_steps=4000",
-        "width 128": "operator.width=128",
+        "width 128": "network.width=128",
     },
     "short losses": {
         "huber": f"{STEEP} loss.norm=huber",
@@ -129,8 +130,8 @@ RECIPES: dict[str, dict[str, str]] = {
         "labels": f"{HNO} sampler=labels",
         "rollout": f"{HNO} sampler=rollout",
         "hardest quarter": f"{HNO} loss.hardest=0.25",
-        "penalty rising from 5 %": f"operator=hno_annealed_height +operator.exact_terminal=true {TO_THE_END}",
-        "penalty steepening from 5 %": f"operator=hno_annealed_slope +operator.exact_terminal=true {TO_THE_END}",
+        "penalty rising from 5 %": f"{HARDENING} ++loss.terms.annealed.constant=penalty_height",
+        "penalty steepening from 5 %": f"{HARDENING} ++loss.terms.annealed.constant=penalty_slope",
         "supervised finish": FINISHED,
         "band, supervised finish": f"{FINISHED} sampler=band",
         "supervised finish, 20 %": LATE,

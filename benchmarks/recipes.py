@@ -19,7 +19,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import annealed  # noqa: F401  # registers operators
+import annealed  # noqa: F401  # registers a loss term
 import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
@@ -29,13 +29,14 @@ from rich.table import Table
 
 from hno.cli.config import config_dir, register_plugins
 from hno.cli.results import Results, config_hash
-from hno.cli.train import fit
+from hno.cli.train import train_operator
+from hno.control import Feedback
 from hno.control.rollout import rollout
 from hno.data.certificates import safe
 from hno.data.labels import Request, default_cache, safe_labels_for
 from hno.evaluation.metrics import clopper_pearson
 from hno.games import make
-from hno.training.checkpoint import OperatorPolicy, load_policy
+from hno.training.checkpoint import load_policy
 from hno.training.validation import Starts, starts_of
 from hno.types import part
 
@@ -55,7 +56,7 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
     head = {"game": config.game.name, "operator": config.operator.name, "seed": config.seed, "config_hash": key}
     results = Results(path, head)
     try:
-        fit(config, folder, results)
+        train_operator(config, folder, results)
         results.update(status="trained")
     except RuntimeError as error:
         results.update(status="failed", reason=str(error))
@@ -75,7 +76,7 @@ def starts(game_name: str, suite: str) -> tuple[Starts, list[int]]:
     return starts_of(kept), [len(labels.status) for labels in kept]
 
 
-def play(policy: OperatorPolicy, suite: str, at: Starts, sizes: Sequence[int]) -> dict[str, Any]:
+def play(policy: Feedback, suite: str, at: Starts, sizes: Sequence[int]) -> dict[str, Any]:
     """Collisions by type and the excess of joint costs."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

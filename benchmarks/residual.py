@@ -13,7 +13,7 @@ import argparse
 import json
 from pathlib import Path
 
-import annealed  # noqa: F401  # registers operators
+import annealed  # noqa: F401  # registers a loss term
 import torch
 from rich.console import Console
 from rich.table import Table
@@ -34,10 +34,10 @@ def main() -> None:
     columns = [f"{region}, {which}" for which in ("seen", "unseen") for region in REGIONS]
     table, everything = Table("run", *columns, "collisions at (2, 2)", "in all"), {}
     for folder in folders:
-        operator = load_operator(folder / json.loads((folder / "results.json").read_text())["checkpoint"])
-        requests = [Request(theta, 128, 1000, "test") for theta in (operator.seen_types[0], UNSEEN)]
+        operator, _, origin = load_operator(folder / json.loads((folder / "results.json").read_text())["checkpoint"])
+        requests = [Request(theta, 128, 1000, "test") for theta in (origin.types[0], UNSEEN)]
         labels, _ = labels_for(operator.game, requests, default_cache())
-        rows = residual_table(operator, labels)
+        rows = residual_table(operator, labels, origin.types)
         found = {column: row.scaled for column, row in zip(columns, rows, strict=True)}
         suite = json.loads((folder / "suites.json").read_text())["validation"]
         place = [(a, b) for a in range(1, 6) for b in range(1, 6)].index(UNSEEN)

@@ -21,11 +21,16 @@ import torch
 from torch import Tensor
 
 from hno.games import make
-from hno.losses import Scales, hji_residual
-from hno.operators import ValueOperator, operators
+from hno.losses import View, hji_residual, make_objective
+from hno.losses.hji import HJIResidual
+from hno.operators import Architecture, Choice, ValueOperator, make_operator
 from hno.operators.inputs import ego_views
+from hno.training.module import TrainingModule
 from hno.types import Batch, Field, Labels, Points, Sample, Types
 
+ARCHITECTURE = Architecture(Choice("gradient", {"exact_terminal": False}), activation=Choice("tanh"))
+"""The paper's."""
+WEIGHTS = {"value": 1.0, "costate": 1.0, "boundary": 1.0, "residual": 1.0}
 TYPES = torch.tensor([[1.0, 1], [1, 5], [5, 1], [5, 5], [1, 3], [3, 3], [3, 5]])
 
 
@@ -44,19 +49,17 @@ def random_batch(operator: ValueOperator, rows: int, seed: int = 0) -> Batch:
 
 def published_field(operator: ValueOperator, points: Points) -> Field:
     """Values and derivatives player by player, from a branch and an autograd pass of second order for each."""
-    game, net = operator.game, operator.net
+    game, net = operator.game, operator.networks[0]
     tau, x, theta = points
     values, slopes, costates = [], [], []
     for player in range(game.players):
         own = tau.clone().requires_grad_()
         state = x.clone().requires_grad_()
-        view = ego_views(game.state_box.scale(state))[:, player].flatten(1)
-        inputs = [(2 * own / game.horizon - 1).unsqueeze(-1), view]
-        if operator.has_roles:
-            inputs.append(torch.full_like(inputs[0], game.roles[player]))
-        value = (tanh_net(net.trunk, torch.cat(inputs, -1)) * tanh_net(net.branch, game.sensors(theta)[:, player])).sum(
-            -1
-        )
+        myself, *others = ego_views(game.state_box.scale(state))[:, player].unbind(1)
+        time = (2 * own / game.horizon - 1).unsqueeze(-1)
+        role = [torch.full_like(time, game.roles[player])] * (len(set(game.roles)) > 1)
+        trunk = tanh_net(net.trunk, torch.cat([time, myself, *role, *others], -1))
+        value = (trunk * tanh_net(net.branch, game.sensors(theta)[:, player])).sum(-1)
         slope, costate = torch.autograd.grad(value.sum(), (own, state), create_graph=True)
         values.append(value)
         slopes.append(slope)
@@ -73,40 +76,45 @@ def tanh_net(net: torch.nn.Module, z: Tensor) -> Tensor:
 
 
 def published_loss(operator: ValueOperator, batch: Batch) -> Tensor:
-    """The loss of `ValueOperator.training_step`, stream by stream and type by type."""
-    total = torch.zeros((), device=operator.device)
+    """The loss of `TrainingModule.training_step`, stream by stream and type by type."""
+    total = torch.zeros_like(operator.value_scale)
     for stream, sample in batch.items():
         field = published_field(operator, sample.points)
         rows = len(sample.points.tau)
         for theta in TYPES:
             mine = (sample.points.theta == theta).all(-1)
-            points, part = Points(*(p[mine] for p in sample.points)), Field(*(p[mine] for p in field))
+            part = Field(*(p[mine] for p in field))
             share = mine.sum() / rows
-            for name, weight in operator.weights.items():
-                if operator.term(name).stream == stream:
-                    total = total + weight * share * residual(operator, name, points, part, sample, mine).abs().mean()
+            for name in TERMS[stream]:
+                found = residual(operator, name, sample.rows(mine), part)
+                total = total + WEIGHTS[name] * share * found.abs().mean()
     return total
 
 
-def residual(operator: ValueOperator, name: str, points: Points, field: Field, sample: Sample, mine: Tensor) -> Tensor:
+TERMS = {"bvp": ("value", "costate"), "interior": ("residual",), "terminal": ("boundary",)}
+"""Loss terms by the stream that they read."""
+
+
+def residual(operator: ValueOperator, name: str, sample: Sample, field: Field) -> Tensor:
     """Scaled residual of one term for some rows."""
-    game, scales = operator.game, Scales(operator.value_scale, operator.costate_scale)
+    game, scales, points = operator.game, operator.scales, sample.points
     if name == "residual":
-        return hji_residual(game, points, field) / operator.term(name).scale(game, Sample(points), scales)
+        view = View(game, sample, field, lambda at: published_field(operator, at), scales, 0)
+        return hji_residual(game, points, field) / HJIResidual().scale(view)
     if name == "boundary":
         return (field.value - game.terminal_value(points.x)) / scales.value
     assert sample.labels is not None
     if name == "value":
-        return (field.value - sample.labels.value[mine]) / scales.value
-    return (field.costate - sample.labels.costate[mine]) / scales.costate
+        return (field.value - sample.labels.value) / scales.value
+    return (field.costate - sample.labels.costate) / scales.costate
 
 
-def step(operator: ValueOperator, loss: Callable[[], Tensor], optimizer: torch.optim.Optimizer) -> None:
+def step(loss: Callable[[], Tensor], optimizer: torch.optim.Optimizer) -> None:
     """One step."""
     optimizer.zero_grad()
     loss().backward()
     optimizer.step()
-    if operator.device.type == "cuda":
+    if torch.cuda.is_initialized():
         torch.cuda.synchronize()
 
 
@@ -121,7 +129,7 @@ def gradients(operator: ValueOperator, loss: Callable[[], Tensor]) -> Iterator[T
     """Of every parameter."""
     operator.zero_grad()
     loss().backward()
-    for parameter in operator.net.parameters():
+    for parameter in operator.parameters():
         assert parameter.grad is not None
         yield parameter.grad.clone()
 
@@ -134,16 +142,17 @@ def difference(ours: Iterator[Tensor], theirs: Iterator[Tensor]) -> float:
 def measure(name: str, rows: int, repeats: int, device: torch.device, *, compiles: bool) -> dict[str, float]:
     """Medians of both steps, alternating."""
     torch.manual_seed(0)
-    ours = operators.get("hno")(make(name)).to(device)
-    ours.log_dict = ours.log = lambda *_, **__: None  # type: ignore[method-assign]  # there is no trainer to log to
-    theirs = copy.deepcopy(ours)
+    objective = make_objective({term: {} for term in WEIGHTS}, WEIGHTS)
+    module = TrainingModule(make_operator(make(name), ARCHITECTURE), objective).to(device)
+    module.log_dict = module.log = lambda *_, **__: None  # type: ignore[method-assign]  # there is no trainer to log to
+    ours, theirs = module.operator, copy.deepcopy(module.operator)
     if compiles:
         ours.compile_kernels()
-    batch = ours.transfer_batch_to_device(random_batch(ours, rows), device, 0)
-    losses = (lambda: published_loss(theirs, batch)), (lambda: ours.training_step(batch, 0))
+    batch = module.transfer_batch_to_device(random_batch(ours, rows), device, 0)
+    losses = (lambda: published_loss(theirs, batch)), (lambda: module.training_step(batch, 0))
     error = difference(gradients(ours, losses[1]), gradients(theirs, losses[0]))
-    adam, fused = torch.optim.Adam(theirs.net.parameters()), torch.optim.Adam(ours.net.parameters(), fused=True)
-    runs = (lambda: step(theirs, losses[0], adam)), (lambda: step(ours, losses[1], fused))
+    adam, fused = torch.optim.Adam(theirs.parameters()), torch.optim.Adam(ours.parameters(), fused=True)
+    runs = (lambda: step(losses[0], adam)), (lambda: step(losses[1], fused))
     for run in runs:
         run()
     times = [[seconds(run) for run in runs] for _ in range(repeats)]

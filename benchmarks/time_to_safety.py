@@ -23,10 +23,10 @@ from hydra import compose, initialize_config_dir
 from rich.console import Console
 from rich.table import Table
 
-from hno.cli.build import build_data, build_game, build_operator
+from hno.cli.build import build_data, build_game
 from hno.cli.config import config_dir
 from hno.cli.results import Results
-from hno.cli.train import fit
+from hno.cli.train import train_operator
 from hno.data.labels import labels_for
 
 
@@ -35,13 +35,13 @@ def measure(game: str, seed: int, starts: int, threads: int, overrides: list[str
     fixed = [f"game={game}", f"seed={seed}", f"validation.starts={starts}", f"trainer.threads={threads}", "logger=csv"]
     with initialize_config_dir(str(config_dir()), version_base=None):
         config = compose("train", overrides=["experiment=fast", *fixed, *overrides])
-    operator = build_operator(config, build_game(config))
+    data = build_data(config, build_game(config), frozenset({"bvp"}))
     with tempfile.TemporaryDirectory() as folder:
-        found, labels = labels_for(operator.game, build_data(config, operator).requests, Path(folder))
+        found, labels = labels_for(data.game, data.requests, Path(folder))
     with tempfile.TemporaryDirectory() as folder:
         results = Results(Path(folder) / "results.json", {})
         began = time.perf_counter()
-        fit(config, Path(folder), results)
+        train_operator(config, Path(folder), results)
         whole = time.perf_counter() - began
     seconds, best = results.content["seconds"], results.content["validation"]
     rate = best["collision_rate"]

@@ -22,6 +22,7 @@ LEVELS = (
     {"report"},
     {"hno"},
     {"cli"},
+    {"__main__"},
 )
 """Who may import whom: a part imports itself and the levels before its own."""
 STRANGERS = {("data", "operators"), ("operators", "data"), ("training", "evaluation"), ("evaluation", "training")}

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import importlib
+import inspect
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
@@ -13,6 +15,9 @@ import pytest
 
 import hno
 from hno.cli.kinds import REGISTRIES
+from hno.data import make_sampler
+from hno.games import make
+from hno.operators import Architecture, make_operator
 from hno.registry import BrokenPluginWarning, Registry, UnknownNameError, check_options, options_of
 
 PACKAGE = """
@@ -268,9 +273,49 @@ def test_classes_know_their_names(animals):
         ("hno.losses", "losses", {"boundary", "costate", "residual", "value"}),
         ("hno.operators", "operators", {"gradient"}),
         ("hno.operators", "networks", {"deeponet"}),
-        ("hno.data.sources", "sources", {"band", "box", "labels", "rollout"}),
+        ("hno.operators", "activations", {"relu", "sin", "tanh"}),
+        ("hno.data", "sources", {"band", "box", "labels", "rollout"}),
         ("hno.training.optimizers", "optimizers", {"adam", "adamw", "muon", "soap"}),
     ],
 )
 def test_the_package_registers_what_it_ships(module, name, known):
     assert known <= set(getattr(importlib.import_module(module), name).names())
+
+
+class Kettle:
+    def __init__(self, litres: float, whistle: bool = True) -> None:
+        self.litres, self.whistle = litres, whistle
+
+
+def test_options_are_the_arguments_and_their_defaults():
+    assert options_of(Kettle) == {"litres": inspect.Parameter.empty, "whistle": True}
+    assert options_of(Kettle, skip=("litres",)) == {"whistle": True}
+
+
+def test_an_unknown_option_comes_with_the_known_ones_and_the_nearest():
+    check_options("kettle", Kettle, ["whistle", "litres"])
+    with pytest.raises(UnknownNameError, match=r"No option of kettle named 'whistel'\. Known: litres, whistle\. Did"):
+        check_options("kettle", Kettle, ["litres", "whistel"])
+    with pytest.raises(UnknownNameError, match=r"Known: whistle\.$"):
+        check_options("kettle", Kettle, ["litres"], skip=("litres",))
+    with pytest.raises(UnknownNameError, match=r"Known: none\.$"):
+        check_options("box", lambda: None, ["x"])
+
+
+@pytest.mark.parametrize(
+    ("part", "options"),
+    [("operator", ("game", "network")), ("network", ("inputs", "activation")), ("activation", ())],
+)
+def test_an_operator_refuses_options_that_its_parts_do_not_know(part, options):
+    for option in ("widht", *options):
+        wrong = replace(Architecture(), **{part: replace(getattr(Architecture(), part), options={option: 1})})
+        with pytest.raises(UnknownNameError, match=rf"No option of {part} \w+ named '{option}'\. Known: "):
+            make_operator(make("narrow_road"), wrong)
+
+
+@pytest.mark.parametrize("name", ["box", "band", "labels", "rollout"])
+def test_a_source_refuses_options_that_it_does_not_know(name):
+    with pytest.raises(UnknownNameError, match=f"No option of source {name} named 'raech'. Known: "):
+        make_sampler({name: {"share": 1.0, "raech": 2.0}})
+    with pytest.raises(UnknownNameError, match=r"No source named 'bix'\. Known: band, box, .*Did you mean 'box'"):
+        make_sampler({"bix": 1.0, name: 1.0})

@@ -23,6 +23,9 @@ KNOWN = FLAGS | VALUE_FLAGS | HYDRA_FLAGS | HYDRA_VALUE_FLAGS
 TYPES = re.compile(r"""(\+*(?:theta|unseen|(?:\w+\.)*types)=)([-+.\d][^'"\[\]{}$]*[,;][^'"\[\]{}$]*)""")
 """Player types as a list of numbers, which Hydra's grammar takes in quotes only."""
 
+SHARE = re.compile(r"\+*(sampler\.\w+)=([\d.,e-]+)")
+"""The share of a source by itself: its options stay as they are."""
+
 
 class UsageError(ValueError):
     """Words that make no command; the message says what was expected."""
@@ -71,7 +74,8 @@ def parse(given: Sequence[str]) -> Arguments:
 def rewritten(override: str, groups: Collection[str], untouched: Collection[str]) -> str:
     """An override as Hydra is to see it: any key may be set, since the schema judges the result.
 
-    A list of player types is quoted; `a.b=c` and `+a.b=c` become `++a.b=c`, `+group=choice` becomes `group=choice`.
+    A list of player types is quoted, `sampler.<source>=0.2` means the source's share; `a.b=c` and `+a.b=c` become
+    `++a.b=c`, `+group=choice` becomes `group=choice`.
 
     Args:
         override: as given.
@@ -86,5 +90,7 @@ def rewritten(override: str, groups: Collection[str], untouched: Collection[str]
         return f"{key.lstrip('+')}{equals}{value}"
     if bare in untouched:
         return override
-    types = TYPES.fullmatch(override)
+    types, share = TYPES.fullmatch(override), SHARE.fullmatch(override)
+    if share is not None:
+        return f"++{share[1]}.share={share[2]}"
     return f"++{key.lstrip('+')}={repr(types[2]) if types else value}"

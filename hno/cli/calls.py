@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -46,6 +47,7 @@ def train(
     checked = check(compose("train", for_hydra("train", _arguments("train", chosen))))
     place = Path(folder)
     place.mkdir(parents=True, exist_ok=True)
+    warnings.filterwarnings("ignore", message=".*exists and is not empty")  # results.json is there first
     fitted = train_operator(checked, place, Results(place / "results.json", {"game": name, "operator": method}))
     return load_policy(fitted.checkpoint)
 

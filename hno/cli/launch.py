@@ -85,8 +85,8 @@ def _run_jobs(name: str, check: Callable[[DictConfig], S], task: Callable[[S], b
         jobs.extend([] if current is None else [current])
         try:
             settings = check(config)
-        except REFUSALS as error:
-            outcomes.append(_refused(explain(error)))
+        except Exception as error:
+            outcomes.append(_refused(error))
             return
         folders.append(Path(HydraConfig.get().runtime.output_dir))
         outcomes.append(task(settings))
@@ -102,12 +102,12 @@ def _run_jobs(name: str, check: Callable[[DictConfig], S], task: Callable[[S], b
     return 0 if all(outcomes) else 1
 
 
-def _refused(reason: str) -> bool:
+def _refused(error: Exception) -> bool:
     """Leave the reason in the results of a job that is not run: it is no failure of the jobs after it."""
-    found = HydraConfig.get()
+    found, reason = HydraConfig.get(), explain(error)
     chosen = {group: found.runtime.choices.get(group) for group in NAMED}
     Results(Path(found.runtime.output_dir) / "results.json", chosen).update(status="failed", reason=reason)
-    log.error("%s", reason)
+    log.error("%s", reason, exc_info=None if isinstance(error, REFUSALS) else error)
     return False
 
 

@@ -45,6 +45,9 @@ def test_unknown_flags_and_missing_values_are_refused(words: list[str], message:
         ("theta=grid5,grid9", "++theta=grid5,grid9"),
         ("data.types=[[1,1],[5,5]]", "++data.types=[[1,1],[5,5]]"),
         ("seed=0,1,2", "++seed=0,1,2"),
+        ("sampler.band=0.2,0.5", "++sampler.band.share=0.2,0.5"),
+        ("sampler.band.reach=2", "++sampler.band.reach=2"),
+        ("sampler.band=null", "++sampler.band=null"),
     ],
 )
 def test_overrides_are_written_as_hydra_takes_them(given: str, wanted: str) -> None:
