@@ -49,7 +49,7 @@ def name(page: Path) -> str:
 
 
 class Shell:
-    """A folder in which a reader works, with `hno` on the path and with labels of its own.
+    """A folder in which a reader works, with `hno` on the path.
 
     Args:
         folder: empty.
@@ -65,7 +65,6 @@ class Shell:
         self.environment = os.environ | {
             "PATH": f"{bin_folder}:{Path(sys.executable).parent}:{os.environ['PATH']}",
             "PYTHONPATH": f"{self.site}:{ROOT}",
-            "HNO_CACHE": str(folder / "cache"),
             "OMP_NUM_THREADS": "1",
             "WANDB_MODE": "offline",
         }
@@ -115,6 +114,14 @@ def test_python_on_a_page_is_python(page: Path) -> None:
 def test_links_of_pages_outside_the_site_exist(page: Path) -> None:
     for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):
         assert (ROOT / target).exists(), target
+
+
+def test_pages_that_the_sources_name_exist() -> None:
+    sources = [path for folder in ("hno", "conf", "benchmarks", "examples") for path in (ROOT / folder).rglob("*")]
+    for path in sources:
+        if path.suffix in (".py", ".yaml", ".toml"):
+            for page in re.findall(r"docs/[\w/-]+\.\w+", path.read_text(encoding="utf-8")):
+                assert (ROOT / page).exists(), f"{path} names {page}"
 
 
 OWN = re.compile(r"=(crossing|values|parametric|adagrad)\b|\.(smooth|starts)\b|mine\.safetensors")
@@ -203,8 +210,9 @@ def test_extensions_on_the_how_to_pages_train_together(shell: Shell) -> None:
         "import parametric, smooth, starts\nfrom hno.cli.main import main\nraise SystemExit(main())\n"
     )
     shell.run(
-        "python train_all.py train experiment=smoke operator=hno loss.terms.smooth.spread=0.02 loss.weights.smooth=0.1 "
-        'network=parametric network.width=16 "sampler.starts={share: 0.5, widen: 2.0}" --to run'
+        "python train_all.py train experiment=smoke data.types=[[1,1]] data.workers=1 evaluation.dt=0.1 operator=hno "
+        "loss.terms.smooth.spread=0.02 loss.weights.smooth=0.1 network=parametric network.width=16 "
+        '"sampler.starts={share: 0.5, widen: 2.0}" --to run'
     )
     results = json.loads((shell.folder / "run/results.json").read_text())
     assert results["status"] == "finished"
