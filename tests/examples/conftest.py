@@ -16,10 +16,14 @@ from hno.operators import Architecture, Choice, ValueOperator, make_operator, ne
 from hno.training import Fitted, Settings, fit
 from hno.training.module import TrainingModule
 from hno.training.optimizers import optimizers
+from tests.cli.conftest import clean_globals, command, no_pages
+
+__all__ = ["clean_globals", "command", "no_pages"]
 
 FOLDER = Path(__file__).parents[2] / "examples"
 LABELS = {"value": {}, "costate": {}}
 """The terms that compare with labels."""
+SMALL = Choice("deeponet", {"width": 32, "depth": 3})
 
 
 @pytest.fixture
@@ -71,7 +75,7 @@ def train(cache: Path, tmp_path: Path) -> Train:
         *,
         terms: Mapping[str, Mapping[str, Any]] = LABELS,
         weights: Mapping[str, float] | None = None,
-        network: Choice = Choice("deeponet", {"width": 32, "depth": 3}),
+        network: Choice = SMALL,
         sampler: Mapping[str, Any] | None = None,
         optimizer: Mapping[str, Any] | None = None,
         trajectories: int = 6,

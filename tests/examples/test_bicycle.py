@@ -1,10 +1,10 @@
 from __future__ import annotations
 
 import torch
+from hno_examples.bicycle import Bicycle
 
 import hno
 from hno.games.testing import check_game
-from hno_examples.bicycle import Bicycle
 from tests.examples.conftest import Train
 
 

@@ -3,11 +3,11 @@ from __future__ import annotations
 import itertools
 
 import torch
+from hno_examples.three_walkers import ThreeWalkers
 
 import hno
 from hno.games.testing import check_game
 from hno.types import Points
-from hno_examples.three_walkers import ThreeWalkers
 from tests.examples.conftest import Train
 
 ORDERS = [list(order) for order in itertools.permutations(range(3))]

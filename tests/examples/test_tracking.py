@@ -2,10 +2,10 @@ from __future__ import annotations
 
 import pytest
 import torch
+from hno_examples.tracking import Tracking
 
 import hno
 from hno.games.testing import check_game
-from hno_examples.tracking import Tracking
 from tests.examples.conftest import Train
 
 
