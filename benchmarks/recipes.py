@@ -21,14 +21,13 @@ from typing import Any
 
 import annealed  # noqa: F401  # registers a loss term
 import torch
-from hydra import compose, initialize_config_dir
-from omegaconf import DictConfig
 from recipe_sets import FEWER, MOST, RECIPES, SUITES
 from rich.console import Console
 from rich.table import Table
 
-from hno.cli.config import config_dir, register_plugins
+from hno.cli.calls import train_settings
 from hno.cli.results import Results, config_hash
+from hno.cli.schema import TrainSettings
 from hno.cli.train import train_operator
 from hno.control import Feedback
 from hno.control.rollout import rollout
@@ -44,19 +43,24 @@ Cases = dict[str, tuple[Starts, list[int]]]
 """Starts of suites that were loaded, and how many there are of each type."""
 
 
-def run(config: DictConfig, folder: Path) -> dict[str, Any]:
+def run(settings: TrainSettings, folder: Path) -> dict[str, Any]:
     """Train one recipe, or read what is there."""
-    path, key = folder / "results.json", config_hash(config)
+    path, key = folder / "results.json", config_hash(settings)
     if path.exists():
         content = json.loads(path.read_text())
         if content["status"] == "trained" and content.get("config_hash") == key:
             return content
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "suites.json").unlink(missing_ok=True)
-    head = {"game": config.game.name, "operator": config.operator.name, "seed": config.seed, "config_hash": key}
+    head = {
+        "game": settings.game.name,
+        "operator": settings.operator["name"],
+        "seed": settings.seed,
+        "config_hash": key,
+    }
     results = Results(path, head)
     try:
-        train_operator(config, folder, results)
+        train_operator(settings, folder, results)
         results.update(status="trained")
     except RuntimeError as error:
         results.update(status="failed", reason=str(error))
@@ -136,11 +140,10 @@ def compared(
     """One recipe over the seeds: medians, and every suite pooled; None if no seed could be trained."""
     rows = []
     for seed in arguments.seeds:
-        with initialize_config_dir(str(config_dir()), version_base=None):
-            fixed = [f"game={game}", f"seed={seed}", f"trainer.threads={arguments.threads}", "logger=csv"]
-            config = compose("train", overrides=[*fixed, "++operator.members=1", *overrides.split()])
+        fixed = [f"game={game}", f"seed={seed}", f"trainer.threads={arguments.threads}", "logger=csv"]
+        settings = train_settings([*fixed, "operator.members=1", *overrides.split()])
         folder = arguments.out / arguments.set / game / name / str(seed)
-        content = run(config, folder)
+        content = run(settings, folder)
         if content["status"] != "trained":
             print(f"{game} {name} seed {seed} failed: {content['reason']}")
             continue
@@ -188,7 +191,6 @@ def main() -> None:
         logging.getLogger(name).setLevel(logging.ERROR)
     warnings.filterwarnings("ignore", module="lightning.*|torch.*")
     torch.set_num_threads(arguments.threads)
-    register_plugins()
     console, everything = Console(width=60 + 50 * len(arguments.suites)), {}
     for game in arguments.games:
         cases: Cases = {}

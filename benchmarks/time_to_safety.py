@@ -19,12 +19,11 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-from hydra import compose, initialize_config_dir
 from rich.console import Console
 from rich.table import Table
 
 from hno.cli.build import build_data, build_game
-from hno.cli.config import config_dir
+from hno.cli.calls import train_settings
 from hno.cli.results import Results
 from hno.cli.train import train_operator
 from hno.data.labels import labels_for
@@ -33,15 +32,14 @@ from hno.data.labels import labels_for
 def measure(game: str, seed: int, starts: int, threads: int, overrides: list[str]) -> dict[str, Any]:
     """One game and seed."""
     fixed = [f"game={game}", f"seed={seed}", f"validation.starts={starts}", f"trainer.threads={threads}", "logger=csv"]
-    with initialize_config_dir(str(config_dir()), version_base=None):
-        config = compose("train", overrides=["experiment=fast", *fixed, *overrides])
-    data = build_data(config, build_game(config), frozenset({"bvp"}))
+    settings = train_settings(["experiment=fast", *fixed, *overrides])
+    data = build_data(settings, build_game(settings.game), frozenset({"bvp"}))
     with tempfile.TemporaryDirectory() as folder:
         found, labels = labels_for(data.game, data.requests, Path(folder))
     with tempfile.TemporaryDirectory() as folder:
         results = Results(Path(folder) / "results.json", {})
         began = time.perf_counter()
-        train_operator(config, Path(folder), results)
+        train_operator(settings, Path(folder), results)
         whole = time.perf_counter() - began
     seconds, best = results.content["seconds"], results.content["validation"]
     rate = best["collision_rate"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from hno.cli.config import compose, for_hydra, groups, quoted, register_plugins
 from hno.cli.evaluate import check as check_evaluation
 from hno.cli.evaluate import checkpoints_of, evaluate_models
 from hno.cli.results import Results
+from hno.cli.schema import TrainSettings
 from hno.cli.train import train_operator
 from hno.games import Game, games
 from hno.training.checkpoint import LearnedPolicy, load_policy
@@ -43,8 +44,7 @@ def train(
     name = game if isinstance(game, str) else games.name_of(type(game))
     constants = {} if isinstance(game, str) else {f"game.constants.{k}": v for k, v in game.constants.items()}
     chosen = {"logger": "csv", "game": name, "operator": method, **constants, **(settings or {})}
-    register_plugins()
-    checked = check(compose("train", for_hydra("train", _arguments("train", chosen))))
+    checked = train_settings(_overrides("train", chosen))
     place = Path(folder)
     place.mkdir(parents=True, exist_ok=True)
     warnings.filterwarnings("ignore", message=".*exists and is not empty")  # results.json is there first
@@ -71,7 +71,8 @@ def evaluate(
     """
     chosen = {"checkpoint": str(checkpoint), **(settings or {})}
     register_plugins()
-    checked = check_evaluation(compose("evaluate", for_hydra("evaluate", _arguments("evaluate", chosen))))
+    given = Arguments([], _overrides("evaluate", chosen), {})
+    checked = check_evaluation(compose("evaluate", for_hydra("evaluate", given)))
     with tempfile.TemporaryDirectory() as nowhere:
         place = Path(nowhere if folder is None else folder)
         place.mkdir(parents=True, exist_ok=True)
@@ -80,9 +81,15 @@ def evaluate(
     return results.content
 
 
-def _arguments(name: str, settings: Mapping[str, Any]) -> Arguments:
+def train_settings(overrides: Sequence[str]) -> TrainSettings:
+    """The checked settings of a training, from overrides as on the command line. Raises as `train`."""
+    register_plugins()
+    return check(compose("train", for_hydra("train", Arguments([], list(overrides), {}))))
+
+
+def _overrides(name: str, settings: Mapping[str, Any]) -> list[str]:
     composed = groups(name)
-    return Arguments([], [f"{k}={v if k in composed else _text(v)}" for k, v in settings.items()], {})
+    return [f"{key}={value if key in composed else _text(value)}" for key, value in settings.items()]
 
 
 def _text(value: Any) -> str:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import importlib.util
 import inspect
+import os
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import sys
+from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
@@ -15,10 +17,10 @@ from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.plugins import Plugins
-from hydra.errors import HydraException
+from hydra.errors import HydraException, OverrideParseException
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
+from omegaconf.errors import OmegaConfBaseException
 
 import hno
 from hno.cli.arguments import Arguments, UsageError, rewritten
@@ -167,8 +169,11 @@ def _swept(name: str, experiment: Sequence[str]) -> set[str]:
 
 def compose(name: str, overrides: Sequence[str]) -> DictConfig:
     """A configuration as Hydra composes it, without a job; interpolations that name `hydra` work."""
-    with hydra.initialize_config_dir(str(config_dir()), version_base="1.3"):
-        config = hydra.compose(name, overrides=list(overrides), return_hydra_config=True)
+    try:
+        with hydra.initialize_config_dir(str(config_dir()), version_base="1.3"):
+            config = hydra.compose(name, overrides=list(overrides), return_hydra_config=True)
+    except OverrideParseException as error:
+        raise SettingsError(f"{error.override} cannot be read: {str(error).splitlines()[0]}.") from error
     HydraConfig.instance().set_config(config)
     OmegaConf.set_struct(config, False)
     del config["hydra"]
@@ -215,7 +220,7 @@ def configured(name: str, model: type[S], given: Arguments) -> S | None:
                 del config[key]
         settings = read(model, config)
     except (HydraException, OmegaConfBaseException) as error:
-        raise SettingsError(explain(error)) from error
+        raise SettingsError(str(error)) from error
     if "--dry-run" not in given.flags:
         return settings
     print(OmegaConf.to_yaml(OmegaConf.create(settings.model_dump())), end="")
@@ -227,30 +232,19 @@ def quoted(value: str) -> str:
     return "'" + re.sub(r"(\\*)'", r"\1\1\\'", value) + "'"
 
 
-def explain(error: Exception) -> str:
-    """The message of a configuration error; unknown keys come with the known ones and the nearest."""
-    cause = error.__cause__
-    if isinstance(cause, (ConfigAttributeError, ConfigKeyError)) and isinstance(cause.parent_node, DictConfig):
-        known = sorted(str(key) for key in cause.parent_node)
-        return f"{cause.full_key} does not exist. " + unknown_name("configuration key", str(cause.key), known)
-    return str(error)
+def under_hydra(name: str, job: Callable[[DictConfig], Any], words: Sequence[str]) -> None:
+    """Let Hydra run jobs on a command line; its exceptions reach the caller, who says what they mean."""
+    before = sys.argv
+    sys.argv = [before[0], *words]
+    os.environ["HYDRA_FULL_ERROR"] = "1"
+    try:
+        hydra.main(version_base="1.3", config_path=str(config_dir()), config_name=name)(job)()
+    finally:
+        sys.argv = before
 
 
-def comments(text: str) -> Iterator[tuple[str, str]]:
-    """Keys of a yaml file, with dots, and the comments that stand behind them."""
-    above: list[tuple[int, str]] = []
-    for line in text.splitlines():
-        match = re.match(r"( *)([\w]+):(.*)$", line)
-        if match is None:
-            continue
-        above = [entry for entry in above if entry[0] < len(match[1])] + [(len(match[1]), match[2])]
-        comment = re.search(r"(?:^|\s)#\s*(.+)$", match[3])
-        if comment is not None:
-            yield ".".join(key for _, key in above), comment[1]
-
-
-def heading(path: Path) -> str:
-    """The first sentence of the comment at the head of a yaml file."""
-    lines = path.read_text(encoding="utf-8").splitlines()
-    head = [line.lstrip("# ") for line in lines if line.startswith("#") and "@package" not in line]
-    return re.split(r"(?<=\.) ", " ".join(head))[0].rstrip(".") if lines and lines[0].startswith("#") else ""
+def hydras_own(name: str, given: Arguments) -> int:
+    """What Hydra does by itself: shell completion, and its help."""
+    Plugins.instance().register(Folders)
+    under_hydra(name, lambda config: None, [*given.hydra, *given.overrides])
+    return 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,8 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
 from hno.cli.arguments import Arguments
-from hno.cli.config import choices, comments, compose, config_dir, for_hydra, groups, heading
+from hno.cli.config import choices, compose, config_dir, for_hydra, groups
+from hno.cli.schema import SettingsError
 
 BESIDE = 44
 """The column of comments."""
@@ -23,7 +25,7 @@ def configuration_help(name: str, given: Arguments) -> str:
     overrides = for_hydra(name, given)
     try:
         config = compose(name, overrides)
-    except HydraException:  # values of a sweep, or mistakes of which a run will speak
+    except (HydraException, SettingsError):  # values of a sweep, or mistakes of which a run will speak
         config = compose(name, [])
     said = dict(comments((config_dir() / f"{name}.yaml").read_text(encoding="utf-8")))
     parts = []
@@ -66,3 +68,23 @@ def _flow(value: object) -> str:
         return "(required)"
     text = yaml.safe_dump(value, default_flow_style=True, width=10**6, sort_keys=False)
     return str(text).removesuffix("\n").removesuffix("\n...")
+
+
+def comments(text: str) -> Iterator[tuple[str, str]]:
+    """Keys of a yaml file, with dots, and the comments that stand behind them."""
+    above: list[tuple[int, str]] = []
+    for line in text.splitlines():
+        match = re.match(r"( *)([\w]+):(.*)$", line)
+        if match is None:
+            continue
+        above = [entry for entry in above if entry[0] < len(match[1])] + [(len(match[1]), match[2])]
+        comment = re.search(r"(?:^|\s)#\s*(.+)$", match[3])
+        if comment is not None:
+            yield ".".join(key for _, key in above), comment[1]
+
+
+def heading(path: Path) -> str:
+    """The first sentence of the comment at the head of a yaml file."""
+    lines = path.read_text(encoding="utf-8").splitlines()
+    head = [line.lstrip("# ") for line in lines if line.startswith("#") and "@package" not in line]
+    return re.split(r"(?<=\.) ", " ".join(head))[0].rstrip(".") if lines and lines[0].startswith("#") else ""

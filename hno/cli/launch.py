@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import logging
-import os
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
-import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
@@ -19,7 +15,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from hno.cli import pages
 from hno.cli.arguments import Arguments
-from hno.cli.config import compose, config_dir, explain, for_hydra, quoted, register_plugins
+from hno.cli.config import compose, for_hydra, quoted, register_plugins, under_hydra
 from hno.cli.results import Results
 from hno.cli.schema import S, Settings
 from hno.cli.sweep import Job, counted, show_jobs
@@ -48,9 +44,6 @@ def run(name: str, check: Callable[[DictConfig], S], task: Callable[[S], bool], 
     Returns:
         The exit code: 1 if a job failed.
     """
-    if "--shell-completion" in given.flags or "--hydra-help" in given.flags:
-        _hydra(name, lambda config: None, [*given.hydra, *given.overrides])
-        return 0
     overrides = for_hydra(name, given)
     register_plugins()
     many, dry = "--multirun" in given.flags, "--dry-run" in given.flags
@@ -67,7 +60,7 @@ def run(name: str, check: Callable[[DictConfig], S], task: Callable[[S], bool], 
     except OSError as error:
         return _refuse(f"The output folder cannot be written ({error}). Choose another with --to <folder>.")
     except REFUSALS as error:
-        return _refuse(explain(error))
+        return _refuse(str(error))
 
 
 def _refuse(message: str) -> int:
@@ -92,7 +85,7 @@ def _run_jobs(name: str, check: Callable[[DictConfig], S], task: Callable[[S], b
         outcomes.append(task(settings))
 
     try:
-        _hydra(name, job, words)
+        under_hydra(name, job, words)
     finally:
         if jobs:
             show_jobs(jobs)
@@ -104,7 +97,7 @@ def _run_jobs(name: str, check: Callable[[DictConfig], S], task: Callable[[S], b
 
 def _refused(error: Exception) -> bool:
     """Leave the reason in the results of a job that is not run: it is no failure of the jobs after it."""
-    found, reason = HydraConfig.get(), explain(error)
+    found, reason = HydraConfig.get(), str(error)
     chosen = {group: found.runtime.choices.get(group) for group in NAMED}
     Results(Path(found.runtime.output_dir) / "results.json", chosen).update(status="failed", reason=reason)
     log.error("%s", reason, exc_info=None if isinstance(error, REFUSALS) else error)
@@ -122,30 +115,13 @@ def _dry_jobs(name: str, check: Callable[[DictConfig], Settings], overrides: Seq
         try:
             check(config)
         except REFUSALS as error:
-            reason = f"\n   refused: {explain(error)}"
+            reason = f"\n   refused: {error}"
         outcomes.append(not reason)
         print(f"{found.number}: {' '.join(found.settings)}{reason}")
 
     quiet = ["hydra/hydra_logging=disabled", "hydra/job_logging=disabled", "hydra.output_subdir=null"]
     with tempfile.TemporaryDirectory() as folder:
-        _hydra(name, job, ["--multirun", *overrides, *quiet, f"hydra.sweep.dir={quoted(folder)}"])
+        under_hydra(name, job, ["--multirun", *overrides, *quiet, f"hydra.sweep.dir={quoted(folder)}"])
     refused = outcomes.count(False)
     print(counted(len(outcomes)) + (f", {refused} refused" if refused else ""))
     return 1 if refused else 0
-
-
-def _hydra(name: str, job: Callable[[DictConfig], Any], words: Sequence[str]) -> None:
-    with _argv(words):
-        hydra.main(version_base="1.3", config_path=str(config_dir()), config_name=name)(job)()
-
-
-@contextmanager
-def _argv(words: Sequence[str]) -> Iterator[None]:
-    """What Hydra reads as its command line; its exceptions reach us, and we say what they mean."""
-    before = sys.argv
-    sys.argv = [before[0], *words]
-    os.environ["HYDRA_FULL_ERROR"] = "1"
-    try:
-        yield
-    finally:
-        sys.argv = before

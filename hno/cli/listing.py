@@ -8,7 +8,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from hno.cli.arguments import Arguments, UsageError
-from hno.cli.config import choices, config_dir, heading
+from hno.cli.config import choices, config_dir
+from hno.cli.help import heading
 from hno.cli.kinds import REGISTRIES
 from hno.registry import Description, plural, unknown_name
 

@@ -103,6 +103,9 @@ def main(given: Sequence[str] | None = None, prog: str | None = None) -> int:
     except UsageError as error:
         print(error, file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        print("Interrupted.", file=sys.stderr)
+        return 130
 
 
 def _run(command: Command, given: Arguments, prog: str) -> int:
@@ -115,6 +118,10 @@ def _run(command: Command, given: Arguments, prog: str) -> int:
     if "--help" in given.flags:
         print(_help(command, given, prog))
         return 0
+    if command.config is not None and {"--shell-completion", "--hydra-help"} & given.flags.keys():
+        from hno.cli.config import hydras_own
+
+        return hydras_own(command.config, given)
     return int(pkgutil.resolve_name(command.run)(_configured(command, given, prog)))
 
 

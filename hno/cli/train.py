@@ -126,12 +126,14 @@ def train_operator(settings: TrainSettings, folder: Path, results: Results) -> F
     results.time("labels", data.label_seconds)
     results.update(label_statistics=label_statistics(data.extremals))
     first, later = validation_starts(settings, data, results)
+    before = results.content["seconds"].get("validation_labels", 0.0)
     fitted = fit(
         operator, objective, data, build_settings(settings), folder, validation=first, later=later, record=entries,
         loggers=makers, callbacks=[progress_bar() or StepLines(settings.trainer.print_every)], resume=resume,
     )  # fmt: skip
-    for name, seconds in fitted.seconds.items():
-        results.time(name, seconds)
+    solving = results.content["seconds"].get("validation_labels", 0.0) - before  # while validation played
+    results.time("training", fitted.seconds["training"])
+    results.time("validation", fitted.seconds["validation"] - solving)
     results.update(
         steps=fitted.trainer.global_step,
         checkpoint=fitted.checkpoint.name,

@@ -13,6 +13,7 @@ from hno.control.policy import Policy, as_policy
 from hno.games import Game
 from hno.games.kinematics import separation
 from hno.pontryagin.integrate import runge_kutta
+from hno.pontryagin.threads import torch_threads
 from hno.types import Trajectory
 
 __all__ = ["Disturbance", "Player", "control_steps", "rollout"]
@@ -21,7 +22,6 @@ Player = Policy | Callable[[Tensor, Tensor, Tensor], Tensor]
 """A policy, or a bare function (tau (B,), x (B, P, n), theta (B, P)) -> controls (B, P, m)."""
 
 
-@torch.no_grad()
 def rollout(
     game: Game,
     policy: Player,
@@ -31,6 +31,7 @@ def rollout(
     substeps: int = 4,
     points: int = 4,
     disturbance: Disturbance = Disturbance(),
+    threads: int = 1,
 ) -> Trajectory:
     """Play the game from every start.
 
@@ -46,10 +47,37 @@ def rollout(
         substeps: Runge-Kutta steps within `dt`.
         points: states, interpolated within each of these, at which constraints and running costs are evaluated.
         disturbance: of controls, motion and beliefs.
+        threads: of torch, see `torch_threads`.
 
     Raises:
         ValueError: the horizon is not a whole multiple of `dt`, or states are pushed that the game does not have.
     """
+    with torch_threads(threads), torch.no_grad():
+        return _played(game, policy, x0, theta, dt, substeps, points, disturbance)
+
+
+def control_steps(game: Game, dt: float) -> int:
+    """Number of controls that an episode holds for `dt` each.
+
+    Raises:
+        ValueError: the horizon is not a whole multiple of `dt`.
+    """
+    steps = game.horizon / dt if math.isfinite(dt) and dt > 0 else 0.0
+    if round(steps) < 1 or abs(steps - round(steps)) > 1e-6:
+        raise ValueError(f"dt must be a positive time that divides the horizon of {game.horizon:g} s; got {dt:g} s.")
+    return round(steps)
+
+
+def _played(
+    game: Game,
+    policy: Player,
+    x0: Tensor,
+    theta: Tensor,
+    dt: float,
+    substeps: int,
+    points: int,
+    disturbance: Disturbance,
+) -> Trajectory:
     steps = control_steps(game, dt)
     noise = control_noise(game, x0, theta, steps, disturbance)
     push = state_push(game, x0, theta, steps, disturbance)
@@ -80,18 +108,6 @@ def rollout(
     t = torch.linspace(0, game.horizon, steps + 1, dtype=x0.dtype, device=x0.device)
     value = value + game.terminal_value(x)
     return Trajectory(t, torch.stack(path, 1), torch.stack(controls, 1), value, clearance, distance)
-
-
-def control_steps(game: Game, dt: float) -> int:
-    """Number of controls that an episode holds for `dt` each.
-
-    Raises:
-        ValueError: the horizon is not a whole multiple of `dt`.
-    """
-    steps = game.horizon / dt if math.isfinite(dt) and dt > 0 else 0.0
-    if round(steps) < 1 or abs(steps - round(steps)) > 1e-6:
-        raise ValueError(f"dt must be a positive time that divides the horizon of {game.horizon:g} s; got {dt:g} s.")
-    return round(steps)
 
 
 def _believing(game: Game, policy: Policy, x0: Tensor, theta: Tensor, disturbance: Disturbance) -> Policy:

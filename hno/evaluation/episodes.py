@@ -74,7 +74,7 @@ def _episode(game: Game, played: Trajectory, label: Extremal, row: int) -> dict[
 
 def _radius(game: Game, places: Tensor, violation: Tensor) -> Any:
     """Distance of players below which it is a collision at each time, m; None where the constraint is no distance."""
-    if game.players == 1 or game.constraint_unit != "m":
+    if game.players == 1 or not game.distance_constraints:
         return None
     return _rounded(violation + separation(places).amin(-1))
 

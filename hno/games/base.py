@@ -79,7 +79,9 @@ class Game(FinalMethods, nn.Module, abc.ABC):
     penalty_slope: float = 5.0
     """Steepness of the penalty, per unit of the constraint."""
     constraint_unit: str = "m"
-    """Unit of the constraints, and so of the clearance; m says that they are distances."""
+    """Unit of the constraints, and so of the clearance."""
+    distance_constraints: bool = True
+    """Whether they are radii minus distances of `positions`; pictures draw the radius then."""
 
     def __getattr__(self, name: str) -> Any:
         """Name what a game has not set, also where one of its properties needs it."""

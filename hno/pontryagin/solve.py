@@ -18,6 +18,7 @@ from hno.pontryagin.newton import Newton, Solved, newton, rescue
 from hno.pontryagin.saturation import nodes_at_kinks
 from hno.pontryagin.starts import Search, Starts, find_starts
 from hno.pontryagin.sweep import costates, values
+from hno.pontryagin.threads import torch_threads
 from hno.types import Extremal, Status, join
 
 
@@ -34,7 +35,7 @@ class Solver(NamedTuple):
     """States that are solved together; bounds the memory."""
 
 
-def solve(game: Game, x0: Tensor, theta: Tensor, settings: Solver = Solver()) -> Extremal:
+def solve(game: Game, x0: Tensor, theta: Tensor, settings: Solver = Solver(), threads: int = 1) -> Extremal:
     """The cheapest open-loop equilibrium found from several starts, for every initial state.
 
     Args:
@@ -42,6 +43,7 @@ def solve(game: Game, x0: Tensor, theta: Tensor, settings: Solver = Solver()) ->
         x0: initial states, (B, P, n).
         theta: player types, (B, P).
         settings: solver settings.
+        threads: of torch, see `torch_threads`.
 
     Returns:
         One extremal per row. Rows without a converged start carry the status and residual of their best attempt.
@@ -50,7 +52,10 @@ def solve(game: Game, x0: Tensor, theta: Tensor, settings: Solver = Solver()) ->
         ValueError: wrong shapes or entries that are not finite.
     """
     _check(game, x0, theta)
-    with torch.inference_mode(False):  # adjoints are gradients, which that mode would turn into zeros
+    with (
+        torch_threads(threads),
+        torch.inference_mode(False),
+    ):  # adjoints are gradients, which that mode would turn into zeros
         game = copy.deepcopy(game).to(x0.device).double()
         x0, theta = x0.detach().clone().double(), theta.detach().clone().to(x0.device).double()
         parts = zip(x0.split(settings.chunk), theta.split(settings.chunk), strict=True)

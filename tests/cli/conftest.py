@@ -83,8 +83,12 @@ def command(
         monkeypatch.setattr(sys, "argv", [name])
         capsys.readouterr()
         to = [f"hydra.run.dir={folder}"] if name in ("train", "evaluate") else []
-        code = main([name, *words, *to])
-        return Outcome(code, "".join(capsys.readouterr()), folder)
+        code: int | str | None
+        try:
+            code = main([name, *words, *to])
+        except SystemExit as stop:  # Lightning's, after an interruption
+            code = stop.code
+        return Outcome(int(code or 0), "".join(capsys.readouterr()), folder)
 
     return run
 

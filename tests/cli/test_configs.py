@@ -9,6 +9,7 @@ from omegaconf import DictConfig
 
 from hno.cli.arguments import Arguments
 from hno.cli.build import build_architecture, build_data, build_game, build_objective, check, streams
+from hno.cli.calls import train_settings
 from hno.cli.config import choices, compose, config_dir, for_hydra, groups, register_plugins
 from hno.cli.results import config_hash
 from hno.cli.schema import TrainSettings
@@ -36,7 +37,7 @@ def composed(*overrides: str, name: str = "train") -> DictConfig:
 
 def settings(*overrides: str) -> TrainSettings:
     """The settings of a training that passes its check."""
-    return check(composed(*overrides))
+    return train_settings(overrides)
 
 
 def data_of(chosen: TrainSettings) -> GameData:

@@ -149,7 +149,7 @@ def test_cache_is_that_of_the_environment_by_default(
         ({"game.constants.radios": "1.3"}, "Did you mean 'radius'?"),
         ({"game.constants.radius": "wide"}, "'radius' of narrow_road must be finite"),
         ({"game.constants": "5"}, "game.constants must be a mapping"),
-        ({"game.constants.radius": "[1"}, "mismatched input"),
+        ({"game.constants.radius": "[1"}, "++game.constants.radius=[1 cannot be read"),
         ({"cache": "/proc/nowhere"}, "Labels cannot be written to /proc/nowhere"),
     ],
     ids=str,

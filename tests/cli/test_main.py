@@ -50,6 +50,14 @@ def test_help_and_version_import_nothing_heavy(words: tuple[str, ...]) -> None:
     assert printed == f"hno {hno.__version__}\n" if "--version" in words else printed.startswith("Usage: hno")
 
 
+def test_completion_imports_nothing_heavy(monkeypatch: pytest.MonkeyPatch) -> None:
+    line = "train.py optimizer="
+    monkeypatch.setenv("COMP_LINE", line)
+    monkeypatch.setenv("COMP_POINT", str(len(line)))
+    code = f"from hno.cli.main import main; main(['train', '-sc', 'query=bash']); {HEAVY}; assert not heavy, heavy"
+    assert python("-c", code).split() == [f"optimizer={name}" for name in ("adam", "adamw", "muon", "soap")]
+
+
 @pytest.mark.parametrize("file", ["train.py", "evaluate.py"])
 def test_the_scripts_are_the_commands(file: str) -> None:
     assert python(file, "--version") == f"hno {hno.__version__}\n"

@@ -3,7 +3,7 @@ from __future__ import annotations
 import csv
 import itertools
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -13,15 +13,18 @@ import torch
 from torch import Tensor
 
 import hno
-from hno.cli import evaluate
+from hno.cli import evaluate, train
 from hno.cli.media import draw_typical
 from hno.cli.results import Results
 from hno.cli.train import label_statistics
+from hno.data.labels import Request
 from hno.evaluation import outcome
 from hno.evaluation.closed_loop import TypeRow
-from hno.games import make
+from hno.games import Game, make
+from hno.training import validation
 from hno.training.divergence import StopOnDivergence
-from hno.types import Status, join, part
+from hno.training.validation import Score, Starts
+from hno.types import Extremal, Status, Trajectory, join, part
 from tests.cli.conftest import SMOKE, Command, Outcome
 from tests.fakes import fake_labels
 
@@ -137,9 +140,9 @@ def test_run_leaves_a_picture_of_an_episode(command: Command, monkeypatch: pytes
 
 def test_label_sizes_are_the_scales_of_the_network(command: Command) -> None:
     scaled = command("train", *SMOKE, "trainer.max_steps=1")
-    assert float(weights(scaled.folder)["value_scale"]) > 1
+    assert float(weights(scaled.folder)["operator.value_scale"]) > 1
     physical = command("train", *SMOKE, "trainer.max_steps=1", "loss.scaled=false")
-    assert float(weights(physical.folder)["value_scale"]) == 1
+    assert float(weights(physical.folder)["operator.value_scale"]) == 1
 
 
 SIX = (*SMOKE, "trainer.max_steps=6", "trainer.validate_every=3", "trainer.print_every=1")
@@ -288,3 +291,25 @@ def test_every_step_is_logged_once_to_csv_with_finite_losses(command: Command) -
     rows = losses(run.folder)
     assert rows
     assert all(float(row["loss/total"]) > 0 for row in rows)
+
+
+@pytest.mark.parametrize(("collide", "asked"), [(True, [8]), (False, [8, 40])])
+def test_most_validation_labels_are_solved_when_they_are_needed(
+    command: Command, monkeypatch: pytest.MonkeyPatch, collide: bool, asked: list[int]
+) -> None:
+    """The first starts come before the training; the others once none of these collides."""
+    starts: list[int] = []
+
+    def solve(game: Game, requests: Sequence[Request], *others: Any, **options: Any) -> tuple[list[Extremal], float]:
+        starts.extend(request.starts for request in requests)
+        return [fake_labels(game, request.theta, request.starts) for request in requests], 0.0
+
+    def found(played: Trajectory, begun: Starts) -> Score:
+        return Score(float(collide), 0.0)
+
+    monkeypatch.setattr(train, "safe_labels_for", solve)
+    monkeypatch.setattr(validation, "score", found)
+    run = command("train", *SMOKE, "validation.types=1,1", "validation.starts=40", "trainer.max_steps=2")
+    assert run.code == 0, run.text
+    assert starts == asked
+    assert "labels of 8 safe validation starts at each of 1 types" in run.text

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from hno.control.rollout import Disturbance, Policy, rollout
 from hno.games import Game, make
+from hno.pontryagin.threads import torch_threads
 from hno.types import Extremal, Trajectory
 from tests.walkers import Walkers
 
@@ -289,3 +290,18 @@ def test_policies_are_asked_about_finite_states_alone() -> None:
     assert torch.equal(played.value[:1], alone.value)
     pushed = rollout(game, strict, x0, theta, 0.1, disturbance=Disturbance(drift=1e38, belief=0.5))
     assert pushed.u[:, -1].isnan().all()
+
+
+def test_a_rollout_uses_one_thread_and_leave_the_setting_as_it_was() -> None:
+    game, seen = Walkers().double(), []
+
+    def policy(tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
+        seen.append(torch.get_num_threads())
+        return x * 0
+
+    x0, theta = game.initial_box.sample(1, torch.Generator().manual_seed(0)), torch.ones(1, 2, dtype=torch.float64)
+    with torch_threads(3):
+        rollout(game, policy, x0, theta, dt=0.5)
+        rollout(game, policy, x0, theta, dt=0.5, threads=2)
+        assert torch.get_num_threads() == 3
+    assert seen == [1, 1, 2, 2]

@@ -18,7 +18,7 @@ from hno.evaluation.closed_loop import collision_table
 from hno.games import Game, make
 from hno.training import validation
 from hno.training.module import TrainingModule
-from hno.training.validation import BEST, ClosedLoopValidation, Score, score, starts_of
+from hno.training.validation import BEST, ClosedLoopValidation, Later, Score, score, starts_of
 from hno.types import Extremal, Field, Points, Trajectory, join
 from tests.fakes import fake_labels
 from tests.operators.conftest import MakeModule
@@ -248,6 +248,23 @@ def test_first_starts_are_played_first_and_all_unless_they_collide(
     assert episodes[0][:, 0, 1].tolist() == pytest.approx([*first[:probe], *second[:probe]])
     assert found is not None
     assert found.collision_rate == pytest.approx(rate)
+
+
+@pytest.mark.parametrize(("first", "solved"), [(CLOSE, 0), (SAFE, 1)])
+def test_later_starts_are_solved_once_and_only_when_none_of_the_first_collides(
+    make_validation: Build, walking: Walking, first: float, solved: int
+) -> None:
+    callback, module, asked = make_validation(), walking(straight), list[int]()
+
+    def solve() -> list[Extremal]:
+        asked.append(1)
+        return [labelled([first] * 2 + [CLOSE] * 6)]
+
+    callback.begin([labelled([first] * 2)], Later(20, solve))
+    found = [callback.consider(Trainer(), module) for _ in range(2)]
+    assert len(asked) == solved
+    rate = 6 / 8 if solved else 1.0
+    assert [score.collision_rate for score in found if score is not None] == [rate, rate]
 
 
 def test_a_validation_without_starts_rests(make_validation: Build, walking: Walking, tmp_path: Path) -> None:
