@@ -87,4 +87,4 @@ def test_binned_means_are_means_of_bins() -> None:
 def test_saturation_is_of_each_players_own_box() -> None:
     box = Box([[-1.0], [-5.0]], [[1.0], [5.0]])
     u = torch.tensor([[[[1.0], [1.0]], [[0.0], [-5.0]]]])
-    assert float(computed(lambda: SaturatedShare(box), [(u, torch.ones(1, dtype=torch.bool))])) == 0.5
+    assert saturated_share(u, box) == 0.5
