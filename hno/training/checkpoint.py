@@ -10,10 +10,12 @@ from pathlib import Path
 from typing import Any, final
 
 import torch
+from torch import Tensor
 
 from hno.control.policy import Feedback
 from hno.games import Game, games, make
 from hno.operators import Architecture, Choice, ValueOperator, make_operator
+from hno.pontryagin.threads import torch_threads
 
 KEY = "hno"
 """Checkpoint entry that says how to build the operator and where it comes from."""
@@ -150,11 +152,19 @@ class LearnedPolicy(Feedback):
         operator: the operator.
         architecture: what it is built of.
         provenance: where it comes from.
+        threads: of torch for each answer; one answer is too small for several.
     """
 
-    def __init__(self, operator: ValueOperator, architecture: Architecture, provenance: Provenance) -> None:
+    def __init__(
+        self, operator: ValueOperator, architecture: Architecture, provenance: Provenance, threads: int = 1
+    ) -> None:
         super().__init__(operator)
-        self.architecture, self.provenance = architecture, provenance
+        self.architecture, self.provenance, self.threads = architecture, provenance, threads
+
+    def act(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
+        """As `Feedback.act`, on `threads` threads."""
+        with torch_threads(self.threads):
+            return super().act(tau, x, theta)
 
     @property
     def types(self) -> list[tuple[float, ...]]:
@@ -167,6 +177,6 @@ class LearnedPolicy(Feedback):
         return {"game": game, "operator": self.provenance.method, "activation": self.architecture.activation.name}
 
 
-def load_policy(path: str | Path, game: str | None = None) -> LearnedPolicy:
-    """The policy of the operator in a checkpoint. Arguments and errors as of `load_operator`."""
-    return LearnedPolicy(*load_operator(path, game))
+def load_policy(path: str | Path, game: str | None = None, threads: int = 1) -> LearnedPolicy:
+    """The policy of the operator in a checkpoint. Arguments and errors as of `load_operator` and `LearnedPolicy`."""
+    return LearnedPolicy(*load_operator(path, game), threads)
