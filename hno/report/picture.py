@@ -37,7 +37,8 @@ def rollout_picture(game: Game, played: Trajectory, theta: Tensor, path: Path, t
     x, t = played.x[row], played.t
     places = game.positions(x)
     distance = separation(places).amin(-1)
-    allowed = game.constraint(x, theta[row].expand(len(t), -1)).amax(-1) + distance
+    worst = game.constraint(x, theta[row].expand(len(t), -1)).amax((-2, -1))
+    allowed, round_players = worst + distance, game.distance_constraints and game.players > 1
     figure = Figure(figsize=(9, 5), layout="constrained")
     top, bottom = figure.subplots(2, 1, height_ratios=(3, 2))
     closest = int(distance.argmin())
@@ -46,12 +47,18 @@ def rollout_picture(game: Game, played: Trajectory, theta: Tensor, path: Path, t
         (line,) = top.plot(path_of[:, 0], path_of[:, 1], label=f"player {player + 1}, type {theta[row, player]:g}")
         top.scatter(path_of[::10, 0], path_of[::10, 1], s=12, color=line.get_color())
         top.scatter(*path_of[0, :2], marker="s", color=line.get_color())
-        top.add_patch(_disc(path_of[closest], float(allowed[closest]) / 2, line.get_color()))
+        if round_players:
+            top.add_patch(_disc(path_of[closest], float(allowed[closest]) / 2, line.get_color()))
     top.set(xlabel="x [m]", ylabel="y [m]", title=title)
     top.legend(loc="best", frameon=False)
-    bottom.plot(t, distance, color="black", label="distance between players")
-    bottom.plot(t, allowed, color="crimson", linestyle="--", label="collision radius")
-    bottom.set(xlabel="t [s]", ylabel="[m]", ylim=(0, min(float(distance.max()), 6 * float(allowed.max()))))
+    if round_players:
+        bottom.plot(t, distance, color="black", label="distance between players")
+        bottom.plot(t, allowed, color="crimson", linestyle="--", label="collision radius")
+        bottom.set(ylabel="[m]", ylim=(0, min(float(distance.max()), 6 * float(allowed.max()))))
+    else:
+        bottom.plot(t, -worst, color="black", label="clearance")
+        bottom.set(ylabel=f"[{game.constraint_unit}]")
+    bottom.set(xlabel="t [s]")
     bottom.legend(loc="best", frameon=False)
     figure.savefig(path, dpi=110)
 
