@@ -63,11 +63,7 @@ def heat_map(data: Any, legend: alt.Legend | None = None) -> Layers:
 
 
 def comparison(data: Any) -> Layers:
-    """Collision rates of recipes with their intervals, and of their seeds.
-
-    Args:
-        data: rows of `page_data.comparison`.
-    """
+    """Collision rates of recipes with their intervals, and of their seeds, from rows of `page_data.comparison`."""
     name = alt.Y("recipe:N", sort=None, title=None, axis=alt.Axis(labelLimit=260, ticks=False, domain=False))
     scale = alt.Scale(type="symlog", constant=LEAST / 4, domain=[0, 1], nice=False)
     axis = alt.Axis(values=[0, 0.001, 0.01, 0.1, 1], labelExpr="100 * datum.value + ' %'")
@@ -91,12 +87,7 @@ def comparison(data: Any) -> Layers:
 
 
 def learning_curves(data: Any, scale: Literal["log", "linear"]) -> Layers:
-    """A metric over training steps, one line for every run.
-
-    Args:
-        data: rows with step, value, run and recipe.
-        scale: of the values.
-    """
+    """A metric over training steps, one line for every run, from rows with step, value, run and recipe."""
     values = alt.Scale(type=scale, zero=False, nice=False)
     base = (
         alt.Chart(data)

@@ -81,12 +81,7 @@ def _paths(frames: Any, x: str, y: str) -> alt.Chart:
 
 
 def separation(frames: Any, frame: int = 0) -> Layers:
-    """Distance between players over time, up to six times that below which it is a collision, which is shown too.
-
-    Args:
-        frames: data named "frames", see `episode.frames`.
-        frame: the one marked.
-    """
+    """Distance between players over time, up to six times that below which it is a collision; one frame is marked."""
     far, radius = (f"extent(pluck(data('frames'), '{name}'))[1]" for name in ("distance", "radius"))
     reach = alt.param(name="reach", expr=f"isValid({radius}) ? min({far}, 6 * {radius}) : {far}")
     base = alt.Chart(frames).encode(x=alt.X("t:Q", title="t [s]", axis=alt.Axis(grid=False, tickCount=5)))

@@ -21,7 +21,7 @@ from hno.report.pictures import WIDE, rates, views
 from hno.report.recipes import Recipe, best, headline, recipes
 from hno.report.records import Run
 from hno.report.runs import Sweep
-from hno.report.tables import CACHED, COST, Table, mapping_table, recipe_table
+from hno.report.tables import CACHED, Table, mapping_table, recipe_table
 from hno.report.verdicts import at, clearance, jobs, share, verdict, why
 
 REFERENCE = "tanh"
@@ -29,16 +29,7 @@ REFERENCE = "tanh"
 
 
 def write_figures(sweep: Sweep, folder: Path) -> list[Path]:
-    """Write what a document about a sweep needs.
-
-    Args:
-        sweep: the runs.
-        folder: gets `collisions_<game>`, `comparison_<game>` and `encounter_<game>_<kind>_<view>`, each as SVG and as
-            PNG, and `summary.md`.
-
-    Returns:
-        The files.
-    """
+    """Write charts of every game, each as SVG and as PNG, and `summary.md` into a folder, and return the files."""
     found = recipes(sweep.runs)
     content = {"summary.md": markdown(sweep, found).encode()}
     for game in sorted({recipe.game for recipe in found}):
@@ -80,8 +71,7 @@ def markdown(sweep: Sweep, found: Sequence[Recipe]) -> str:
     """Verdicts and tables."""
     blocks = [f"# {sweep.name}", jobs(sweep)]
     blocks += [f"- **{one.game}**, {one.name}, {share(one.pooled)}. {verdict(one, found)}" for one in best(found)]
-    table = recipe_table(found)
-    blocks += ["## Recipes", table_text(table), "## Time", table_text(table._replace(columns=COST)), CACHED]
+    blocks += ["## Recipes", table_text(recipe_table(found)), CACHED]
     ratios = ratio_table(sweep.runs)
     blocks += ["## Ratios of condition numbers of the tangent kernel", table_text(ratios)] if ratios.rows else []
     missing = [f"- {run.name}: {_plain(why(run))}" for run in sweep.runs if not run.finished]

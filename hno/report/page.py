@@ -39,13 +39,7 @@ FILTERS = ("game", "operator", "activation", "seed")
 
 
 def write_page(sweep: Sweep, path: Path, refresh: float | None = None) -> None:
-    """Write the page, whole or not at all.
-
-    Args:
-        sweep: the runs.
-        path: the file.
-        refresh: seconds after which an open page loads itself again; None for never.
-    """
+    """Write the page, whole or not at all; `refresh` is in how many seconds an open page loads itself again."""
     page = render(sweep, refresh)
     replace_whole(path, lambda draft: draft.write_text(page, encoding="utf-8"))
 

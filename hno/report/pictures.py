@@ -34,12 +34,7 @@ def rates(types: Sequence[Mapping[str, Any]], title: str, number: int = 0) -> ve
 
 
 def collision_map(table: Sequence[Any], path: Path, title: str) -> None:
-    """Draw the collision rate in % of every evaluated pair of types; types with training labels are framed.
-
-    Args:
-        table: rows of results.json's `table`.
-        path: PNG file to write.
-        title: lines above the picture.
+    """Draw the rates of results.json's `table` into a PNG file; types with training labels are framed.
 
     Raises:
         ValueError: there are no rows, or the game does not have two players.
@@ -63,13 +58,7 @@ def views(found: Episode, frame: int, follow: bool, title: str) -> dict[str, veg
 
 
 def rollout_picture(found: Episode, path: Path, title: str) -> None:
-    """Draw one episode: where players go, with discs where they are closest, and how far they stay apart.
-
-    Args:
-        found: the episode.
-        path: PNG file to write.
-        title: lines above the picture.
-    """
+    """Draw into a PNG file where players go, with discs where they are closest, and how far they stay apart."""
     frame = closest(found)
     drawn = list(views(found, frame, False, title).values())
     if distances(found) is not None:

@@ -160,14 +160,8 @@ def _variants(settings: Sequence[Mapping[str, str]]) -> list[str]:
     keys = sorted({key for one in settings for key in one})
     differing = [key for key in keys if len({one.get(key) for one in settings}) > 1]
     more = [f"{len(differing) - SHOWN} more"] if len(differing) > SHOWN else []
-    return [", ".join([f"{key}={_short(one.get(key))}" for key in differing[:SHOWN]] + more) for one in settings]
-
-
-def _short(text: str | None) -> str:
-    """A setting for a label: the last three names of a path, the beginning of anything else."""
-    if text is None:
-        return NOT_AVAILABLE
-    return "/".join(text.split("/")[-3:]) if "/" in text else text[:40]
+    ends = [{key: "/".join(one.get(key, NOT_AVAILABLE).split("/")[-3:]) for key in differing} for one in settings]
+    return [", ".join([f"{key}={one[key]:.40}" for key in differing[:SHOWN]] + more) for one in ends]
 
 
 def _recipe(names: tuple[str, str, str], variant: str, runs: Sequence[Run]) -> Recipe:

@@ -11,8 +11,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.errors import HydraException
 from yaml import YAMLError, safe_load  # type: ignore[import-untyped]  # yaml has no annotations
 
 from hno.report.episode import episode
@@ -45,8 +43,6 @@ class Sweep(NamedTuple):
     skipped: tuple[Skipped, ...]
     command: str | None
     """The command line of the whole sweep; None for single runs."""
-    planned: int | None
-    """How many jobs it has; None where that is not known."""
 
 
 def load(root: Path) -> Sweep:
@@ -69,7 +65,7 @@ def load(root: Path) -> Sweep:
     if not runs:
         found = "; ".join(f"{entry.name}: {entry.reason}" for entry in skipped[:3]) or f"no {RESULTS} in it or below"
         raise NoRunsError(f"{root} holds no run ({found}). Runs are written by train.py and evaluate.py.")
-    return Sweep(root.resolve().name, tuple(runs), tuple(skipped), *_sweep_of(root / "multirun.yaml"))
+    return Sweep(root.resolve().name, tuple(runs), tuple(skipped), _command(root / "multirun.yaml", "-m"))
 
 
 def _candidates(root: Path) -> list[Path]:
@@ -120,7 +116,13 @@ def _run(folder: Path, name: str, content: Mapping[str, Any]) -> Run:
     except ValueError as error:
         raise UnreadableError(f"{RESULTS} is not hno's: {sentence(error)}") from error
     notes, metrics, episodes = list[str](), folder / METRICS, content.get("episodes")
-    found: dict[str, Any] = {"name": name, "notes": notes, "command": _command_of(folder), "settings": _settings(run)}
+    found: dict[str, Any] = {
+        "name": name,
+        "notes": notes,
+        "command": _command(folder / ".hydra" / "hydra.yaml"),
+        "settings": _settings(run),
+    }
+    found["command"] = _command(folder / ".hydra" / "hydra.yaml")
     found["table"] = _each(run.table, type_row, "row of the table", notes)
     with _noted(notes, "no learning curves"):
         found["curves"] = _curves(metrics) if metrics.exists() else {}
@@ -185,32 +187,11 @@ def _flat(value: Any, prefix: str = "") -> dict[str, str]:
     return {prefix: value if isinstance(value, str) else json.dumps(value, default=str)}
 
 
-def _command_of(folder: Path) -> str | None:
-    """The command line that repeats a job; None where Hydra's files are missing or damaged."""
+def _command(path: Path, *flags: str) -> str | None:
+    """The command line of a job or a sweep from a file of Hydra's; None where that is missing or damaged."""
     try:
-        overrides, hydra = (
-            safe_load((folder / ".hydra" / name).read_text()) for name in ("overrides.yaml", "hydra.yaml")
-        )
-        return _command_line(hydra["hydra"], overrides)
-    except (OSError, ValueError, TypeError, LookupError, YAMLError):
+        hydra = safe_load(path.read_text(encoding="utf-8"))["hydra"]
+        script = f"{hydra.get('job', {}).get('name', 'train')}.py"
+        return shlex.join(["python", script, *flags, *map(str, hydra["overrides"]["task"])])
+    except (OSError, ValueError, TypeError, LookupError, AttributeError, YAMLError):
         return None
-
-
-def _command_line(hydra: Mapping[str, Any], arguments: list[Any]) -> str:
-    """What to type; the script is named after Hydra's job."""
-    return shlex.join(["python", f"{hydra.get('job', {}).get('name', 'train')}.py", *map(str, arguments)])
-
-
-def _sweep_of(path: Path) -> tuple[str | None, int | None]:
-    """The command line of a sweep and how many jobs it has; of overrides of one key, the last counts, as for Hydra."""
-    try:
-        hydra = safe_load(path.read_text())["hydra"]
-        overrides = list(map(str, hydra["overrides"]["task"]))
-        params = (hydra.get("sweeper") or {}).get("params") or {}
-        swept = [f"{key}={value}" for key, value in params.items()]
-        parsed = OverridesParser.create().parse_overrides([*swept, *overrides])
-    except (OSError, ValueError, TypeError, LookupError, AttributeError, YAMLError, HydraException):
-        return None, None
-    jobs = {one.get_key_element(): one for one in parsed}.values()
-    planned = math.prod(len(list(one.sweep_string_iterator())) if one.is_sweep_override() else 1 for one in jobs)
-    return _command_line(hydra, ["-m", *overrides]), planned

@@ -78,8 +78,6 @@ RECIPE = (
     Column("training", "training", "s", _rounded), Column("total", "total", "s", _rounded),
     Column("unfinished", "open", format=whole), Column("failed", "failed", format=whole),
 )  # fmt: skip
-COST = tuple(one for one in RECIPE if one.name in ("game", "name", "seeds", "labels", "training", "total"))
-"""Seconds of every stage (the paper's cost table)."""
 RUN = (
     Column("name", "run"), Column("status", "status"), Column("game", "game"), Column("operator", "operator"),
     Column("activation", "activation"), Column("seed", "seed"), Column("steps", "steps", format=whole), *COUNTS,
@@ -125,13 +123,10 @@ def run_table(runs: Sequence[Run]) -> Table:
     return Table(RUN, rows)
 
 
-def type_table(found: Sequence[Row]) -> Table:
+def type_table(found: Sequence[dict[str, Any]]) -> Table:
     """Numbers of a heat map, from rows of `recipes.by_type`."""
-    words = {"seen": "seen", "extrapolated": "extrapolated"}
-    return Table(
-        TYPE,
-        [{**one, "labels": ", ".join(word for flag, word in words.items() if one[flag]) or "unseen"} for one in found],
-    )
+    words = {True: "seen", False: "unseen"}
+    return Table(TYPE, [one | {"labels": words[one["seen"]] + ", extrapolated" * one["extrapolated"]} for one in found])
 
 
 class SectionTable(NamedTuple):
@@ -169,6 +164,8 @@ def mapping_table(entries: Sequence[Row]) -> Table:
 def _text(value: Any) -> str:
     if isinstance(value, list):
         return f"({', '.join(map(_text, value))})"
+    if isinstance(value, dict):
+        return ", ".join(f"{count} {name}" for name, count in value.items() if count)
     return f"{value:.4g}" if isinstance(value, float) else plain(value)
 
 
@@ -178,12 +175,4 @@ def label_tables(runs: Sequence[Run]) -> list[tuple[str, int, Table]]:
     for run in runs:
         if run.label_statistics:
             shared.setdefault(json.dumps([run.game, run.label_statistics], sort_keys=True), []).append(run)
-    rows = [[_label_row(entry) for entry in same[0].label_statistics] for same in shared.values()]
-    return [(same[0].game, len(same), mapping_table(own)) for same, own in zip(shared.values(), rows, strict=True)]
-
-
-def _label_row(entry: Row) -> Row:
-    """Counts by status, as far as they are not 0, as columns of their own."""
-    status = entry.get("status")
-    counts = {name: count for name, count in status.items() if count} if isinstance(status, dict) else {}
-    return {key: value for key, value in entry.items() if key != "status"} | counts
+    return [(same[0].game, len(same), mapping_table(same[0].label_statistics)) for same in shared.values()]

@@ -50,8 +50,7 @@ def jobs(sweep: Sweep) -> str:
     """How many jobs ended how."""
     finished = sum(run.finished for run in sweep.runs)
     failed = sum(run.status == "failed" for run in sweep.runs)
-    waiting = (sweep.planned or 0) - len(sweep.runs) - len(sweep.skipped)
-    counts = {"failed": failed, "unfinished": len(sweep.runs) - finished - failed, "not begun": waiting}
+    counts = {"failed": failed, "unfinished": len(sweep.runs) - finished - failed}
     said = [f"{finished} finished", *(f"{count} {state}" for state, count in counts.items() if count > 0)]
     said += [f"{counted(len(sweep.skipped), 'folder')} skipped"] if sweep.skipped else []
     return f"{counted(len(sweep.runs), 'run')}: {', '.join(said)}."

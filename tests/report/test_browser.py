@@ -195,7 +195,7 @@ def test_numbers_under_a_heat_map_are_those_of_the_tooltip(browser):
     page.wait_for_selector("#tip:not([hidden])")
     text = page.inner_text("#tip")
     assert "safe starts collide" in text
-    collisions, starts, rate = first.split("\t")[2:5]
+    starts, collisions, rate = first.split("\t")[2:5]
     assert f"{collisions} of {starts} safe starts collide: {rate}" in text
 
 
