@@ -21,11 +21,7 @@ LABEL = (
 
 
 def heat_map(data: Any, legend: alt.Legend | None = None) -> Layers:
-    """Collision rates over the types of two players, in % in the cells.
-
-    Args:
-        data: rows of `recipes.by_type`, for tooltips with "tip".
-        legend: of the colours; none by default.
+    """Collision rates over the types of two players, in % in the cells, from rows of `recipes.by_type`.
 
     Its signals: "bound" is "rate", or "high" for the upper end of the rate's interval; "small" says whether cells have
     no room for a number.

@@ -93,12 +93,7 @@ def frames(found: Episode) -> list[dict[str, Any]]:
 
 
 def whole(found: Episode, up: int) -> dict[str, float]:
-    """Signals of `episode_charts.encounter`: everything that happens, with room for discs.
-
-    Args:
-        found: the episode.
-        up: the second axis of the view, 1 or 2.
-    """
+    """Signals of `encounter`: everything that happens, with room for discs; `up` is the second axis, 1 or 2."""
     paths = [path for path in (found.positions, found.label_positions) if path is not None]
     places = np.concatenate(paths)[:, :, [0, up]]
     room = 0.7 * (1.0 if found.radius is None else found.radius.max())

@@ -19,14 +19,8 @@ def encounter(
 ) -> Layers:
     """Players on their way, seen from above or from the side, in true proportion.
 
-    The disc around a player has half the collision radius: discs that overlap are a collision.
-
-    Args:
-        frames: data named "frames", see `episode.frames`.
-        up: the second axis.
-        frame: the one shown.
-        follow: whether to show what surrounds the players at that frame rather than everything.
-        whole: left, right, bottom and top of everything, m.
+    The disc around a player has half the collision radius: discs that overlap are a collision. In view is what
+    surrounds the players at the frame, or the whole. The data must be named "frames", see `episode.frames`.
     """
     params = [alt.param(name=name, value=value) for name, value in {"frame": frame, "follow": follow, **whole}.items()]
     params += [alt.param(name=name, expr=expression) for name, expression in _window(up).items()]

@@ -116,12 +116,7 @@ def _run(folder: Path, name: str, content: Mapping[str, Any]) -> Run:
     except ValueError as error:
         raise UnreadableError(f"{RESULTS} is not hno's: {sentence(error)}") from error
     notes, metrics, episodes = list[str](), folder / METRICS, content.get("episodes")
-    found: dict[str, Any] = {
-        "name": name,
-        "notes": notes,
-        "command": _command(folder / ".hydra" / "hydra.yaml"),
-        "settings": _settings(run),
-    }
+    found: dict[str, Any] = {"name": name, "notes": notes, "settings": _settings(run)}
     found["command"] = _command(folder / ".hydra" / "hydra.yaml")
     found["table"] = _each(run.table, type_row, "row of the table", notes)
     with _noted(notes, "no learning curves"):
