@@ -22,7 +22,7 @@ class Outcome(NamedTuple):
     """What came of some episodes; numbers that do not exist or are not finite are None.
 
     A start counts if its equilibrium is safe: it keeps a stated clearance. All numbers but the first five are over
-    these starts.
+    these starts. There is a field for every entry that results.json has of them, hence so many.
     """
 
     starts: int

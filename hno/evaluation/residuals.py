@@ -21,13 +21,13 @@ from hno.types import Extremal, Points, Sample, Status
 
 REGIONS = ("start box", "PDE box", "constraint band", "around labels", "along labels")
 """Uniform starts at the beginning; uniform in the PDE box; near the surface constraint = 0; nodes of labels with noise,
-as the sampler of collocation points makes them (`hno.data.sampling`); the nodes themselves."""
+as the sampler of collocation points makes them (`hno.data.sources`); the nodes themselves."""
 BINS = 4
 """Equal parts of the horizon by which residuals are reported."""
 
 
 class ResidualRow(NamedTuple):
-    """The HJI residual at one type in one region; numbers that do not exist are None."""
+    """The HJI residual of one type in one region, a field for every entry of results.json; None where it is missing."""
 
     theta: tuple[float, ...]
     """Player types."""

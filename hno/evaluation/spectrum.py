@@ -33,10 +33,9 @@ class Spectrum(NamedTuple):
 
 
 class Ratio(NamedTuple):
-    """A ratio of condition numbers, or what is known of it."""
+    """A ratio of condition numbers, or what is known of it; None where both are cut off, or a matrix is of zeros."""
 
     value: float | None
-    """None where both matrices are cut off, or one is of zeros."""
     bound: str
     """"=" for the ratio itself, ">" or "<" where it is more or less than `value`, "n/a" without one."""
 

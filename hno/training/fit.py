@@ -34,7 +34,7 @@ LONG = 20_000
 
 @dataclass(frozen=True)
 class Settings:
-    """How an operator is trained."""
+    """How an operator is trained: a field for every choice, all with defaults."""
 
     steps: int = 2000
     optimizer: Mapping[str, Any] = field(default_factory=lambda: {"name": "soap"})
@@ -103,7 +103,7 @@ def fit(
         DivergedError: the loss, or the error on held-out labels, is no longer sound.
     """
     optimizer = make_optimizer(steps=settings.steps, **settings.optimizer)
-    module = TrainingModule(operator, objective, optimizer, record=lambda: dict(record or {}))
+    module = TrainingModule(operator, objective, optimizer, record)
     if settings.compile and settings.steps >= LONG:
         operator.compile_kernels()
     data.setup("fit")

@@ -26,7 +26,7 @@ class TrainingModule(L.LightningModule):
         operator: what is trained.
         objective: loss terms and weights.
         optimizer: needed for training only.
-        record: called as a checkpoint is written; its entries are added to it.
+        record: entries that are added to checkpoints.
     """
 
     def __init__(
@@ -34,10 +34,10 @@ class TrainingModule(L.LightningModule):
         operator: ValueOperator,
         objective: Objective,
         optimizer: Optimizer | None = None,
-        record: Callable[[], Mapping[str, Any]] = dict,
+        record: Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__()
-        self.operator, self.objective, self.optimizer, self.record = operator, objective, optimizer, record
+        self.operator, self.objective, self.optimizer, self.record = operator, objective, optimizer, record or {}
         self.terms = objective.used(exact_terminal=operator.meets_terminal)
         self.value_error = WeightedMeanAbsolutePercentageError()
         self.costate_error = WeightedMeanAbsolutePercentageError()
@@ -99,7 +99,7 @@ class TrainingModule(L.LightningModule):
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Add the record."""
-        checkpoint.update(self.record())
+        checkpoint.update(self.record)
 
     def configure_optimizers(self) -> Any:
         """What the `optimizer` argument builds."""
