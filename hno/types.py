@@ -145,6 +145,11 @@ class Extremal(NamedTuple):
     alternatives: Tensor
     """Sum of values of every start that was tried, NaN where it did not converge, shape (B, starts)."""
 
+    @property
+    def cost(self) -> Tensor:
+        """Joint cost of the whole game, shape (B,)."""
+        return -self.value[:, 0].sum(-1)
+
 
 def join(parts: Sequence[Extremal]) -> Extremal:
     """Extremals of one game, one after the other."""
@@ -172,6 +177,11 @@ class Trajectory(NamedTuple):
     """Smallest -constraint over players, their constraints and time, between the nodes too, shape (B,)."""
     distance: Tensor
     """Smallest distance between the positions of two players over time, m, inf for one player, shape (B,)."""
+
+    @property
+    def cost(self) -> Tensor:
+        """Joint cost of the whole episode, shape (B,)."""
+        return -self.value.sum(-1)
 
     @property
     def collided(self) -> Tensor:

@@ -21,12 +21,13 @@ from hno.cli.logs import send_lightning_to_hydra, use_threads
 from hno.cli.media import draw_typical
 from hno.cli.results import Results, config_hash, plain, write_json
 from hno.cli.schema import Episodes, EvaluateSettings
-from hno.cli.sections import check_sections, evaluation_of, run_sections, table_condition
-from hno.cli.starts import TestLabels, cache_folder
+from hno.cli.sections import chosen_sections, run_sections
+from hno.cli.starts import cache_folder, label_solver
 from hno.cli.summary import report, show
 from hno.control.rollout import control_steps
 from hno.evaluation.closed_loop import CollisionTable, play
 from hno.evaluation.comparison import PairedComparison, check_same_game
+from hno.evaluation.conditions import table_condition
 from hno.evaluation.episodes import EPISODES, episodes
 from hno.evaluation.sections import Evaluation
 from hno.games import Game
@@ -56,7 +57,8 @@ def check(config: DictConfig) -> EvaluateSettings:
     with warnings.catch_warnings(action="ignore"):  # the run warns
         policies, types = load(settings)
         for evaluation in describe(settings, list(map(str, checkpoints_of(settings))), policies, types):
-            check_sections(evaluation)
+            for section in chosen_sections(evaluation.options).values():
+                section.check(evaluation)
     return settings
 
 
@@ -65,8 +67,9 @@ def describe(
 ) -> list[Evaluation]:
     """The evaluation of every model, before its labels are solved."""
     options = plain(settings)
-    solve = TestLabels(policies[0].game, types, options, cache_folder(settings.cache), settings.workers)
-    return [evaluation_of(name, policy, types, options, solve) for name, policy in zip(names, policies, strict=True)]
+    solve = label_solver(policies[0].game, types, options, cache_folder(settings.cache), settings.workers)
+    pairs = zip(names, policies, strict=True)
+    return [Evaluation(name, policy, policy.types, types, options, solve) for name, policy in pairs]
 
 
 def load(settings: EvaluateSettings) -> tuple[list[LearnedPolicy], list[tuple[float, ...]]]:

@@ -1,54 +1,22 @@
-"""The sections of an evaluation that the configuration asks for."""
+"""The sections of an evaluation: those that are asked for, computed and printed."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Any
 
+from rich.console import Console
+from rich.table import Table
+
 from hno.cli.results import Results
-from hno.cli.starts import TestLabels
-from hno.control.rollout import Disturbance
-from hno.evaluation.conditions import ENTRIES, Condition, read_condition
 from hno.evaluation.sections import Evaluation, ModelSection, sections
-from hno.games import Game
-from hno.training.checkpoint import LearnedPolicy
-
-
-def table_condition(game: Game, settings: Mapping[str, Any]) -> Condition:
-    """What the collision table is played under. Raises as `read_condition`."""
-    entries = {entry: settings[entry] for entry in ENTRIES if entry in settings}
-    return read_condition(game, entries, Condition(disturbance=Disturbance(seed=settings["seed"])))
-
-
-def evaluation_of(
-    name: str, policy: LearnedPolicy, types: Sequence[tuple[float, ...]], settings: Mapping[str, Any], solve: TestLabels
-) -> Evaluation:
-    """The evaluation of a model as the configuration describes it, before its labels are solved."""
-    return Evaluation(
-        name=name,
-        operator=policy.operator,
-        policy=policy,
-        seen=policy.types,
-        types=types,
-        condition=table_condition(policy.game, settings),
-        clearance=settings["clearance"],
-        dt=settings["dt"],
-        options=settings,
-        solve=solve,
-    )
 
 
 def chosen_sections(options: Mapping[str, Any]) -> dict[str, ModelSection]:
     """The sections of every model that are asked for, by name; the table is no choice."""
     found = {name: sections.get(name)() for name in sections.names() if name != "table" and options.get(name)}
     return {name: section for name, section in found.items() if isinstance(section, ModelSection)}
-
-
-def check_sections(evaluation: Evaluation) -> None:
-    """Raise ValueError for entries that make no sections."""
-    for section in chosen_sections(evaluation.options).values():
-        section.check(evaluation)
 
 
 def run_sections(evaluation: Evaluation, results: Results) -> Iterator[tuple[str, Any]]:
@@ -58,3 +26,25 @@ def run_sections(evaluation: Evaluation, results: Results) -> Iterator[tuple[str
         content = section.compute(evaluation)
         results.time(name, time.perf_counter() - began)
         yield name, content
+
+
+def show_section(name: str, content: Any, results: Mapping[str, Any], console: Console, title: str = "") -> None:
+    """Print a section: its table, under a title or its own heading, and the remarks below it.
+
+    Args:
+        name: of the section.
+        content: of the section.
+        results: the other entries of results.json.
+        console: where to.
+        title: above the table, instead of the section's heading.
+    """
+    section = sections.get(name)()
+    rows = section.rows(content)
+    if rows:
+        titles = (column.title for column in section.columns)
+        table = Table(*titles, title=title or section.heading, caption=section.note or None)
+        for row in rows:
+            table.add_row(*(column.format(row[column.name]) for column in section.columns))
+        console.print(table)
+    for remark in section.remarks(content, results):
+        console.print(remark, soft_wrap=True)

@@ -13,7 +13,7 @@ from lightning.fabric.utilities.exceptions import MisconfigurationException
 from rich.console import Console
 
 import hno
-from hno.cli.tables import show_section
+from hno.cli.sections import show_section
 from hno.evaluation.format import short_names
 from hno.evaluation.sections import sections
 from hno.registry import UnknownNameError

@@ -36,12 +36,13 @@ from hno.cli.logs import (
 from hno.cli.media import publish
 from hno.cli.results import Results, config_hash, plain
 from hno.cli.schema import TrainSettings
-from hno.cli.sections import evaluation_of, run_sections
-from hno.cli.starts import TestLabels, cache_folder
+from hno.cli.sections import run_sections
+from hno.cli.starts import cache_folder, label_solver
 from hno.cli.summary import report, show
 from hno.data.certificates import summary
 from hno.data.datamodule import GameData, safe_sets
 from hno.data.labels import Request, safe_labels_for
+from hno.evaluation.sections import Evaluation
 from hno.games.grid import parse_types
 from hno.operators import make_operator
 from hno.training.checkpoint import Provenance, check_resumable, load_policy, record
@@ -99,8 +100,8 @@ def _run(settings: TrainSettings, folder: Path, results: Results) -> None:
     chosen, policy = plain(settings.evaluation), load_policy(fitted.checkpoint)
     unseen = unseen_types(policy.game, settings.evaluation.types, "evaluation.types")
     types = list(dict.fromkeys([*policy.types, *unseen]))
-    solve = TestLabels(policy.game, types, chosen, cache_folder(settings.data.cache), settings.data.workers)
-    evaluation = evaluation_of(results.content["checkpoint"], policy, types, chosen, solve)
+    solve = label_solver(policy.game, types, chosen, cache_folder(settings.data.cache), settings.data.workers)
+    evaluation = Evaluation(results.content["checkpoint"], policy, policy.types, types, chosen, solve)
     assessed, _ = evaluate_policy(evaluation, solve_tests(evaluation, results), results)
     for name, content in run_sections(assessed, results):
         results.update(**{name: content})

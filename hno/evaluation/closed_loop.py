@@ -6,27 +6,24 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
-from torchmetrics import WeightedMeanAbsolutePercentageError
+from torchmetrics.functional import weighted_mean_absolute_percentage_error
 
 from hno.control.rollout import Disturbance, Player, rollout
 from hno.data.rows import rows_of
 from hno.evaluation import format as text
 from hno.evaluation.outcome import Outcome, outcome, pooled
-from hno.evaluation.sections import Column, Evaluation, ModelSection, sections
+from hno.evaluation.sections import COUNTS, Column, Evaluation, ModelSection, Type, sections
 from hno.games import Game
 from hno.types import Extremal, Field, Points, Status, Trajectory
 
 ValueField = Callable[[Points], Field]
 """A value function with its derivatives, such as `ValueOperator.field`."""
-Type = tuple[float, ...]
-"""Types of all players."""
 
 
 class TypeRow(NamedTuple):
     """One line of the collision table."""
 
     theta: Type
-    """Player types."""
     seen: bool
     """Whether the operator was trained with labels of these types."""
     extrapolated: bool
@@ -34,7 +31,6 @@ class TypeRow(NamedTuple):
     outside_seen: bool
     """Whether they lie outside the smallest box around the types that the operator was trained with, if any."""
     outcome: Outcome
-    """What came of the episodes."""
     value_error: float | None
     """Weighted absolute percentage error of values at the nodes of converged labels, as a fraction, if any."""
     costate_error: float | None
@@ -68,7 +64,8 @@ def collision_table(
         disturbance: of the episodes.
         field: the policy's value function, if it has one.
     """
-    return type_rows(game, labels, play(game, policy, labels, dt, disturbance), seen, clearance, field)
+    played = play(game, policy, labels, dt, disturbance)
+    return [type_row(game, *sets, seen, clearance, field) for sets in zip(labels, played, strict=True)]
 
 
 def play(
@@ -83,41 +80,25 @@ def play(
     return [Trajectory(played.t, *part) for part in columns]
 
 
-def type_rows(
-    game: Game,
-    labels: Sequence[Extremal],
-    played: Sequence[Trajectory],
-    seen: Sequence[Sequence[float]],
-    clearance: float,
-    field: ValueField | None = None,
-) -> list[TypeRow]:
-    """The table of episodes that were played from the starts of labels. See `collision_table`."""
-    known = [tuple(float(t) for t in theta) for theta in seen]
-    return [_row(game, *sets, known, clearance, field) for sets in zip(labels, played, strict=True)]
-
-
-def _row(
+def type_row(
     game: Game,
     labels: Extremal,
     played: Trajectory,
-    seen: Sequence[Type],
+    seen: Sequence[Sequence[float]],
     clearance: float,
-    field: ValueField | None,
+    field: ValueField | None = None,
 ) -> TypeRow:
-    theta = tuple(float(t) for t in labels.theta[0])
+    """The line of one type, from labels and the episodes from their starts. See `collision_table`."""
+    theta, known = tuple(labels.theta[0].tolist()), [tuple(map(float, types)) for types in seen]
+    inside = (min(column) <= t <= max(column) for t, column in zip(theta, zip(*known, strict=True), strict=False))
     return TypeRow(
         theta,
-        theta in seen,
+        theta in known,
         not bool(game.type_box.contains(labels.theta[0].to(game.type_box.lo))),
-        bool(seen) and not _inside_hull(theta, seen),
+        not all(inside),
         outcome(game, labels, played, clearance),
         *((None, None) if field is None else label_errors(game, field, labels)),
     )
-
-
-def _inside_hull(theta: Type, seen: Sequence[Type]) -> bool:
-    """Whether types lie in the smallest box around others."""
-    return all(min(column) <= t <= max(column) for t, column in zip(theta, zip(*seen, strict=True), strict=True))
 
 
 def label_errors(game: Game, field: ValueField, found: Extremal) -> tuple[float | None, float | None]:
@@ -130,10 +111,9 @@ def label_errors(game: Game, field: ValueField, found: Extremal) -> tuple[float 
     points, labels, _ = rows_of(game, [found])
     assert labels is not None
     predicted = field(points)
-    value, costate = WeightedMeanAbsolutePercentageError(), WeightedMeanAbsolutePercentageError()
-    value.update(predicted.value, labels.value)
-    costate.update(predicted.costate.flatten(1), labels.costate.flatten(1))
-    return float(value.compute()), float(costate.compute())
+    pairs = (predicted.value, labels.value), (predicted.costate, labels.costate)
+    value, costate = (float(weighted_mean_absolute_percentage_error(*pair)) for pair in pairs)
+    return value, costate
 
 
 @sections.register("table")
@@ -150,9 +130,7 @@ class CollisionTable(ModelSection):
         Column("theta", "theta", format=text.types),
         Column("labels", "labels"),
         Column("safe", "safe", format=lambda counts: f"{counts[0]:,} of {counts[1]:,}"),
-        Column("collisions", "collisions", format=text.whole),
-        Column("rate", "rate", format=text.percent),
-        Column("interval", "95 % interval", format=text.interval),
+        *COUNTS[1:],
         Column("distances", "distance", "m", text.numbers),
         Column("excess", "excess cost", format=text.cost),
         Column("saturated", "saturated", format=lambda share: text.percent(share, 1)),
@@ -162,9 +140,9 @@ class CollisionTable(ModelSection):
 
     def compute(self, evaluation: Evaluation) -> list[dict[str, Any]]:
         """One line per type."""
-        labels, played, seen = evaluation.labels, evaluation.played, evaluation.seen
-        field, clearance = evaluation.operator.field, evaluation.clearance
-        return [row.content() for row in type_rows(evaluation.game, labels, played, seen, clearance, field)]
+        seen, clearance, field = evaluation.seen, evaluation.clearance, evaluation.policy.operator.field
+        sets = zip(evaluation.labels, evaluation.played, strict=True)
+        return [type_row(evaluation.game, *pair, seen, clearance, field).content() for pair in sets]
 
     def rows(self, content: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         """One line per type, with entries that belong together in one column."""

@@ -41,11 +41,7 @@ class DifferentGamesError(ValueError):
 
 
 def check_same_game(names: Sequence[str], games: Sequence[Game]) -> None:
-    """Refuse to compare models of different games.
-
-    Args:
-        names: of the models, for the message.
-        games: of the models.
+    """Refuse to compare models, by these names, of different games.
 
     Raises:
         DifferentGamesError: the games differ, by class or by constants.
@@ -64,19 +60,12 @@ def _constants(game: Game) -> str:
 
 
 def compare(reference: Tensor, other: Tensor) -> Comparison:
-    """Compare two policies by their collisions.
-
-    Args:
-        reference: whether the reference collides from each start, (B,).
-        other: whether the other one does from the same starts, (B,).
-    """
-    n, both = len(reference), int((reference & other).sum())
-    only_reference, only_other = int((reference & ~other).sum()), int((other & ~reference).sum())
-    counts = n, both, only_reference, only_other
+    """Compare two policies by whether each collides from the same starts, (B,)."""
+    n = len(reference)
+    both, first, second = (int(c.sum()) for c in (reference & other, reference & ~other, other & ~reference))
     if n == 0:
-        return Comparison(*counts, None, None, None)
-    interval = tango(only_reference, only_other, n)
-    return Comparison(*counts, (only_other - only_reference) / n, interval, mcnemar(only_reference, only_other))
+        return Comparison(0, 0, 0, 0, None, None, None)
+    return Comparison(n, both, first, second, (second - first) / n, tango(first, second, n), mcnemar(first, second))
 
 
 def mcnemar(first: int, second: int) -> float:
@@ -91,13 +80,8 @@ def tango(first: int, second: int, pairs: int, confidence: float = 0.95) -> tupl
     """Score interval of the difference of two paired proportions, second minus first (Tango, Stat. Med. 17, 1998).
 
     It holds the differences that a score test does not reject, so that it holds 0 exactly where McNemar's asymptotic
-    test does not reject equal rates, and it has a width without discordant pairs too.
-
-    Args:
-        first: pairs in which only the first event happens.
-        second: pairs in which only the second one does.
-        pairs: all pairs, at least 1.
-        confidence: level.
+    test does not reject equal rates, and it has a width without discordant pairs too. In `first` of the `pairs`, at
+    least 1, only the first event happens, in `second` only the second one.
     """
     z = float(norm.ppf((1 + confidence) / 2))
     return -_upper(second, first, pairs, z), _upper(first, second, pairs, z)

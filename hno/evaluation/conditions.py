@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from hno.control.disturbance import Disturbance, pushed_states
@@ -15,13 +15,11 @@ class Condition(NamedTuple):
     """Where episodes begin, and what disturbs them."""
 
     name: str = ""
-    """Of the condition."""
     widen: float = 1.0
     """Width of the start box in units of the game's."""
     symmetric: bool = False
     """Whether all players start in the same own state."""
     disturbance: Disturbance = Disturbance()
-    """Of the episodes."""
 
     @property
     def starts(self) -> tuple[float, bool]:
@@ -30,16 +28,38 @@ class Condition(NamedTuple):
 
     def entries(self) -> dict[str, Any]:
         """What differs from undisturbed episodes in the game's own start box, by the names of `ENTRIES`."""
-        here, usual = _flat(self), _flat(Condition())
+        here, usual = (dict(zip(_STARTS, c.starts, strict=True)) | c.disturbance._asdict() for c in (self, Condition()))
         return {entry: here[entry] for entry in ENTRIES if here[entry] != usual[entry]}
 
 
-def _flat(condition: Condition) -> dict[str, Any]:
-    return {"widen": condition.widen, "symmetric": condition.symmetric} | condition.disturbance._asdict()
+_STARTS = ("widen", "symmetric")
 
 
-ENTRIES = tuple(entry for entry in _flat(Condition()) if entry != "seed")
-"""What a configuration may say of a condition."""
+def _amount(value: Any) -> bool:
+    return type(value) in (int, float) and 0 <= value < math.inf
+
+
+_AMOUNT = "a finite number of at least 0", _amount
+ENTRIES: Mapping[str, tuple[str, Callable[[Any], bool]]] = {
+    "widen": ("a positive number", lambda value: _amount(value) and value > 0),
+    "symmetric": ("true or false", lambda value: isinstance(value, bool)),
+    "noise": _AMOUNT,
+    "delay": ("a whole number of at least 0", lambda value: type(value) is int and value >= 0),
+    "drift": _AMOUNT,
+    "gusts": _AMOUNT,
+    "components": (
+        "a list of places in a player's state, or null",
+        lambda value: value is None or (isinstance(value, Sequence) and all(type(place) is int for place in value)),
+    ),
+    "belief": _AMOUNT,
+}
+"""What a configuration may say of a condition: what each entry must be, in words and as a test."""
+
+
+def table_condition(game: Game, settings: Mapping[str, Any]) -> Condition:
+    """The condition of the collision table, from the entries of a configuration. Raises as `read_condition`."""
+    entries = {entry: settings[entry] for entry in ENTRIES if entry in settings}
+    return read_condition(game, entries, Condition(disturbance=Disturbance(seed=settings["seed"])))
 
 
 def read_conditions(game: Game, content: object, base: Condition) -> list[Condition]:
@@ -60,42 +80,20 @@ def read_conditions(game: Game, content: object, base: Condition) -> list[Condit
 
 
 def read_condition(game: Game, entries: Mapping[Any, Any], base: Condition, place: str = "") -> Condition:
-    """A condition from a configuration.
-
-    Args:
-        game: the game.
-        entries: what replaces the entries of the base, by the names of `ENTRIES`.
-        base: all other entries.
-        place: where the entries stand, for messages.
+    """A condition whose entries replace those of the base; `place` says in messages where they stand.
 
     Raises:
         ValueError: an entry that does not exist, or a number that makes no sense.
     """
     for entry, value in entries.items():
-        _check(place, entry, value)
+        if entry not in ENTRIES:
+            raise ValueError(f"{place}{entry} does not exist. {unknown_name('condition entry', entry, list(ENTRIES))}")
+        wanted, met = ENTRIES[entry]
+        if not met(value):
+            raise ValueError(f"{place}{entry} must be {wanted}; got {value!r}.")
     pushed_states(game, entries.get("components"))
     chosen: dict[str, Any] = {
         name: tuple(value) if isinstance(value, Sequence) else value for name, value in entries.items()
     }
-    own: dict[str, Any] = {name: chosen.pop(name) for name in ("widen", "symmetric") if name in chosen}
+    own: dict[str, Any] = {name: chosen.pop(name) for name in _STARTS if name in chosen}
     return base._replace(**own, disturbance=base.disturbance._replace(**chosen))
-
-
-def _check(place: str, entry: str, value: object) -> None:
-    """Raise ValueError unless a value fits an entry, by the type of the entry's default."""
-    if entry not in ENTRIES:
-        raise ValueError(f"{place}{entry} does not exist. {unknown_name('condition entry', entry, list(ENTRIES))}")
-    kind, number = type(_flat(Condition())[entry]), type(value) in (int, float)
-    if entry == "components":
-        valid = value is None or (isinstance(value, Sequence) and all(type(place) is int for place in value))
-        wanted = "a list of places in a player's state, or null"
-    elif kind is bool:
-        valid, wanted = isinstance(value, bool), "true or false"
-    elif kind is int:
-        valid, wanted = type(value) is int and value >= 0, "a whole number of at least 0"
-    else:
-        valid, wanted = number and 0 <= value < math.inf, "a finite number of at least 0"  # type: ignore[operator]
-        if entry == "widen":
-            valid, wanted = valid and value != 0, "a positive number"
-    if not valid:
-        raise ValueError(f"{place}{entry} must be {wanted}; got {value!r}.")

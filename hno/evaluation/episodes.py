@@ -38,18 +38,13 @@ def episodes(game: Game, played: Sequence[Trajectory], labels: Sequence[Extremal
     kept = []
     for found, part in zip(labels, played, strict=True):
         counted = safe(found, clearance).nonzero().squeeze(-1)
-        for kind, row in _chosen(part.clearance[counted]).items():
-            kept.append({"kind": kind, **_episode(game, part, found, int(counted[row]))})
+        if len(counted):
+            near = part.clearance[counted]
+            chosen = {"worst": near.argmin(), "typical": near.argsort()[len(near) // 2]}  # NaN is the smallest
+            kept += [{"kind": kind, **_episode(game, part, found, int(counted[k]))} for kind, k in chosen.items()]
     dimensions = game.positions(played[0].x[:1, 0]).shape[-1]
     units = {"players": game.players, "dimensions": dimensions, "constraint_unit": game.constraint_unit}
     return {**units, "episodes": kept}
-
-
-def _chosen(clearance: Tensor) -> dict[str, int]:
-    """Rows by what they stand for: the smallest clearance (NaN first), and the median one."""
-    if len(clearance) == 0:
-        return {}
-    return {"worst": int(clearance.argmin()), "typical": int(clearance.argsort()[len(clearance) // 2])}
 
 
 def _episode(game: Game, played: Trajectory, label: Extremal, row: int) -> dict[str, Any]:
@@ -60,11 +55,11 @@ def _episode(game: Game, played: Trajectory, label: Extremal, row: int) -> dict[
     t, places = played.t[frames], game.positions(played.x[row, frames])
     return {
         "theta": [float(entry) for entry in theta],
-        "collided": not float(played.clearance[row]) > 0,
+        "collided": bool(played.collided[row]),
         "clearance": _rounded(played.clearance[row]),
         "distance": _rounded(played.distance[row]),
-        "cost": _rounded(-played.value[row].sum()),
-        "label_cost": _rounded(-label.value[row, 0].sum()),
+        "cost": _rounded(played.cost[row]),
+        "label_cost": _rounded(label.cost[row]),
         "t": _rounded(t),
         "positions": _rounded(places),
         "radius": _radius(game, places, violation[frames]),

@@ -30,19 +30,16 @@ def check_rows(operator: ValueOperator, rows: object) -> None:
         raise ValueError(f"ntk_rows must be a whole number of at least {least}, the rows of one point; got {rows!r}.")
 
 
-def kernels(operator: ValueOperator, labels: Sequence[Extremal], rows: int, seed: int) -> list[dict[str, Any]]:
-    """JSON content of the kernels at some types, one entry for every set of labels."""
-    return [_entry(operator, found, rows, seed) for found in labels]
-
-
-def _entry(operator: ValueOperator, found: Extremal, rows: int, seed: int) -> dict[str, Any]:
+def type_entry(operator: ValueOperator, found: Extremal, rows: int, seed: int) -> dict[str, Any]:
+    """JSON content of the kernel at one type; a product is None where a network has no trunk and branch."""
     theta = found.theta[0].tolist()
     try:
         kernel = type_kernel(operator, found, rows, seed)
     except NoLabelsError as error:
         return {"theta": theta, "reason": str(error), "points": 0, "block": None, **dict.fromkeys(KINDS)}
-    spectra = {"kernel": summary(kernel.kernel), "product": summary(kernel.product)}
-    return {"theta": theta, "reason": None, "points": kernel.points, "block": kernel.block, **spectra}
+    product = None if kernel.product is None else summary(kernel.product)
+    counts = {"theta": theta, "reason": None, "points": kernel.points, "block": kernel.block}
+    return {**counts, "kernel": summary(kernel.kernel), "product": product}
 
 
 @sections.register("ntk")
@@ -66,7 +63,7 @@ class TangentKernel(ModelSection):
 
     def check(self, evaluation: Evaluation) -> None:
         """Raises ValueError as `check_rows`, and where no type of the training run is evaluated."""
-        check_rows(evaluation.operator, evaluation.options["ntk_rows"])
+        check_rows(evaluation.policy.operator, evaluation.options["ntk_rows"])
         if not set(evaluation.types) & set(evaluation.seen):
             seen = "; ".join(",".join(f"{t:g}" for t in theta) for theta in evaluation.seen) or "none"
             raise ValueError(f'ntk=true needs a type of the training run among theta; these are "{seen}".')
@@ -74,8 +71,8 @@ class TangentKernel(ModelSection):
     def compute(self, evaluation: Evaluation) -> list[dict[str, Any]]:
         """One entry for every evaluated type that the operator was trained with."""
         seen = [found for found in evaluation.labels if tuple(found.theta[0].tolist()) in evaluation.seen]
-        seed = evaluation.condition.disturbance.seed
-        return kernels(evaluation.operator, seen, evaluation.options["ntk_rows"], seed)
+        rows, seed = evaluation.options["ntk_rows"], evaluation.options["seed"]
+        return [type_entry(evaluation.policy.operator, found, rows, seed) for found in seen]
 
     def rows(self, content: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         """Two lines per type, one of each kernel."""

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -31,15 +30,8 @@ class Latency(NamedTuple):
     """95 % quantile of the others, s."""
     processor_time: float | None
     """Median processor time of the others, s: well below `median` on a machine that is busy with other work."""
-
-    @property
-    def rate(self) -> float | None:
-        """Answers per second, from the median, Hz."""
-        return 1 / self.median if self.median else None
-
-    def content(self) -> dict[str, Any]:
-        """JSON content."""
-        return self._asdict() | {"rate": self.rate}
+    rate: float | None
+    """Answers per second, from the median, Hz."""
 
 
 def latency(
@@ -64,15 +56,14 @@ def latency(
     theta = torch.cat([found.theta for found in labels]).float()
     chosen = torch.linspace(0, len(starts) - 1, min(episodes, len(starts))).round().long()
     first, later, processor = list[float](), list[float](), list[float]()
-    with one_thread():
-        for row in chosen:
-            timed = _Timed(make_policy())
-            rollout(game, timed, starts[row : row + 1], theta[row : row + 1], dt)
-            first.append(timed.seconds[0])
-            later += timed.seconds[every::every]
-            processor += timed.processor[every::every]
-    numbers = (_quantile(part, share) for part, share in ((first, 0.5), (later, 0.5), (later, 0.95), (processor, 0.5)))
-    return Latency(len(chosen), len(later), *numbers)
+    for row in chosen:
+        timed = _Timed(make_policy())
+        rollout(game, timed, starts[row : row + 1], theta[row : row + 1], dt, threads=1)
+        first.append(timed.seconds[0])
+        later += timed.seconds[every::every]
+        processor += timed.processor[every::every]
+    middle, slow, busy = _quantile(later, 0.5), _quantile(later, 0.95), _quantile(processor, 0.5)
+    return Latency(len(chosen), len(later), _quantile(first, 0.5), middle, slow, busy, 1 / middle if middle else None)
 
 
 def _quantile(seconds: Sequence[float], share: float) -> float | None:
@@ -84,9 +75,7 @@ class _Timed(Policy):
 
     def __init__(self, policy: Player) -> None:
         self.policy, self.seconds, self.processor = as_policy(policy), list[float](), list[float]()
-
-    def reset(self, x0: Tensor, theta: Tensor) -> None:
-        self.policy.reset(x0, theta)
+        self.reset, self.observe = self.policy.reset, self.policy.observe  # type: ignore[method-assign]
 
     def act(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
         began, worked = time.perf_counter(), time.process_time()
@@ -94,17 +83,3 @@ class _Timed(Policy):
         self.seconds.append(time.perf_counter() - began)
         self.processor.append(time.process_time() - worked)
         return u
-
-    def observe(self, x: Tensor, u: Tensor, dt: float) -> None:
-        self.policy.observe(x, u, dt)
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Let torch use one thread for a while."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)

@@ -12,14 +12,9 @@ from hno.games import Box
 
 
 def quantiles(values: Tensor, shares: Sequence[float]) -> Tensor:
-    """Quantiles of numbers, each one of them: the lower of two neighbours.
+    """Quantiles of numbers (B,), each one of them, the lower of two neighbours: float64, (shares,).
 
-    Args:
-        values: the numbers, (B,).
-        shares: which quantiles, in [0, 1].
-
-    Returns:
-        float64, (shares,); NaN without any number, or with a NaN among them.
+    NaN without any number, or with a NaN among them.
     """
     at = torch.tensor(shares, dtype=torch.float64, device=values.device)
     if len(values) == 0:
@@ -28,31 +23,13 @@ def quantiles(values: Tensor, shares: Sequence[float]) -> Tensor:
 
 
 def saturated_share(u: Tensor, box: Box, tolerance: float = 1e-4) -> float | None:
-    """Share of controls that lie on a bound of their box, over episodes, steps, players and controls.
-
-    Args:
-        u: controls, (B, K, P, m).
-        box: of the controls of each player, (m,) or (P, m).
-        tolerance: distance from a bound that counts as on it, in widths of the box.
-
-    Returns:
-        The share; None without controls.
-    """
+    """Share of controls (B, K, P, m) within `tolerance` widths of a bound of their box; None without controls."""
     inside = torch.minimum(u - box.lo, box.hi - u) / box.width
     return float((inside <= tolerance).double().mean()) if inside.numel() else None
 
 
 def binned_mean(values: Tensor, place: Tensor, bins: int) -> Tensor:
-    """Mean of absolute values in each of several bins.
-
-    Args:
-        values: (B, ...).
-        place: bin of each row, (B,).
-        bins: how many there are.
-
-    Returns:
-        float64, (bins,); NaN where a bin is empty.
-    """
+    """Mean of absolute values (B, ...) by the bin of each row, `place` (B,): float64, (bins,); NaN if empty."""
     rows = values.abs().double().flatten(1)
     total = torch.zeros(bins, dtype=torch.float64, device=rows.device).index_add(0, place, rows.sum(-1))
     return total / (rows.shape[-1] * torch.bincount(place, minlength=bins))

@@ -33,15 +33,14 @@ Parameters = dict[str, Tensor]
 class TypeKernel(NamedTuple):
     """The tangent kernel of an operator at one player type."""
 
-    theta: tuple[float, ...]
     points: int
     """Points whose residuals are its rows."""
     block: int
     """Rows of J that were held at a time, twice."""
     kernel: Spectrum
-    """Of J J', the sum of trunk's and branch's."""
-    product: Spectrum
-    """Of the element-wise product of trunk's and branch's, which the paper calls the tangent kernel."""
+    """Of J J'."""
+    product: Spectrum | None
+    """Of the element-wise product of trunk's and branch's, which the paper calls the tangent kernel; None without."""
 
 
 def type_kernel(operator: ValueOperator, found: Extremal, rows: int, seed: int = 0) -> TypeKernel:
@@ -66,12 +65,10 @@ def type_kernel(operator: ValueOperator, found: Extremal, rows: int, seed: int =
     if len(found.theta.unique(dim=0)) != 1:
         raise ValueError("A tangent kernel is that of one type; pass the labels of each type on their own.")
     drawn = torch.randperm(sample.size, generator=torch.Generator().manual_seed(seed))[: rows // each]
-    trunk, branch = tangent_kernels(operator, sample.rows(drawn))
-    kernel = trunk + branch
-    product = trunk.mul_(branch)
-    del branch
-    block = min(len(drawn), points_per_block(operator)) * each
-    return TypeKernel(tuple(found.theta[0].tolist()), len(drawn), block, spectrum(kernel), spectrum(product))
+    first, *others = tangent_kernels(operator, sample.rows(drawn))
+    kernel = sum(others, first)
+    product = spectrum(first.mul_(others.pop())) if others else None  # in place: kernels are large
+    return TypeKernel(len(drawn), min(len(drawn), points_per_block(operator)) * each, spectrum(kernel), product)
 
 
 def rows_per_point(operator: ValueOperator) -> int:
@@ -86,8 +83,8 @@ def points_per_block(operator: ValueOperator, memory: int = BLOCK_BYTES) -> int:
     return max(1, memory // (2 * row * rows_per_point(operator)))
 
 
-def tangent_kernels(operator: ValueOperator, sample: Sample, memory: int = BLOCK_BYTES) -> tuple[Tensor, Tensor]:
-    """J J' over the parameters of the trunk and over those of the branch; the tangent kernel is their sum.
+def tangent_kernels(operator: ValueOperator, sample: Sample, memory: int = BLOCK_BYTES) -> list[Tensor]:
+    """J J' over each of the `parameter_groups` of an operator; the tangent kernel is their sum.
 
     J is never there as a whole: blocks of its rows are computed as they are needed, again for every pair of them, which
     costs little beside their product.
@@ -98,23 +95,30 @@ def tangent_kernels(operator: ValueOperator, sample: Sample, memory: int = BLOCK
         memory: bytes for two blocks.
 
     Returns:
-        Two matrices (N, N) in float64, N = B * `rows_per_point`; the rows of a point follow each other.
+        Matrices (N, N) in float64, N = B * `rows_per_point`; the rows of a point follow each other.
     """
-    each = rows_per_point(operator)
+    each, groups = rows_per_point(operator), parameter_groups(operator)
     blocks = torch.arange(sample.size).split(points_per_block(operator, memory))
     places = [slice(each * int(block[0]), each * (int(block[-1]) + 1)) for block in blocks]
-    trunk, branch = (operator.value_scale.new_zeros((each * sample.size,) * 2, dtype=torch.float64) for _ in range(2))
+    kernels = [operator.value_scale.new_zeros((each * sample.size,) * 2, dtype=torch.float64) for _ in groups]
     for row, (here, block) in enumerate(zip(places, blocks, strict=True)):
         ours = jacobian(operator, sample.rows(block))
         for there, other in zip(places[: row + 1], blocks[: row + 1], strict=True):
             theirs = ours if other is block else jacobian(operator, sample.rows(other))
-            for kernel, of_branch in ((trunk, False), (branch, True)):
-                names = [name for name in ours if (".branch." in name) == of_branch]
-                product = sum((ours[name] @ theirs[name].mT for name in names), torch.zeros(()))
-                assert isinstance(product, Tensor)
-                kernel[here, there] = product
-                kernel[there, here] = product.mT
-    return trunk, branch
+            for kernel, names in zip(kernels, groups, strict=True):
+                rows, columns = (torch.cat([part[name] for name in names], 1) for part in (ours, theirs))
+                product = rows @ columns.mT
+                kernel[here, there], kernel[there, here] = product, product.mT
+    return kernels
+
+
+def parameter_groups(operator: ValueOperator) -> list[list[str]]:
+    """Names of the trunk's and of the branch's parameters; of all in one group where there are no such two nets."""
+    names = [name for name, _ in operator.named_parameters()]
+    branch = [name for name in names if ".branch." in name]
+    if not branch or not any(".trunk." in name for name in names):
+        return [names]
+    return [[name for name in names if name not in branch], branch]
 
 
 def jacobian(operator: ValueOperator, sample: Sample) -> Parameters:

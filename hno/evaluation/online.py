@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
-from torch import Tensor
 
 from hno.control.receding_horizon import RecedingHorizon
 from hno.control.rollout import Disturbance, Player
@@ -15,40 +14,18 @@ from hno.data.certificates import CLEARANCE, safe
 from hno.evaluation import format as text
 from hno.evaluation.closed_loop import play
 from hno.evaluation.latency import latency
-from hno.evaluation.outcome import Outcome, outcome, together
-from hno.evaluation.sections import Column, Evaluation, ModelSection, sections
+from hno.evaluation.outcome import outcome, together
+from hno.evaluation.sections import COUNTS, Column, Evaluation, ModelSection, sections
 from hno.games import Game
-from hno.types import Extremal, Trajectory, join, part
+from hno.types import Extremal, part
 
 log = logging.getLogger(__name__)
 
-
-class SolverCounts(NamedTuple):
-    """How often the rest of the game was solved, and how."""
-
-    solves: int
-    """In all."""
-    searches: int
-    """Those in which the last plan was no good start, so that several were searched."""
-    failures: int
-    """Those without a solution: the last plan was followed."""
-
-
-class OnlineRow(NamedTuple):
-    """Both controllers on the same starts."""
-
-    theta: tuple[float, ...] | None
-    """Player types; None for all of them together."""
-    policy: Outcome
-    """Of the learned policy."""
-    solver: Outcome
-    """Of the receding-horizon controller."""
-    solves: SolverCounts
-    """Of the receding-horizon controller."""
-
-    def content(self) -> dict[str, Any]:
-        """JSON content."""
-        return {"theta": self.theta, **{name: getattr(self, name)._asdict() for name in self._fields[1:]}}
+CONTROLLERS = {"policy": "learned", "solver": "solved online"}
+"""Names of the two controllers in results.json and in tables."""
+SOLVES = ("solves", "searches", "failures")
+"""How often the rest of the game was solved; how often several plans were searched, because the last one was no good
+start; and how often there was no solution, so that the last plan was followed."""
 
 
 def safe_starts(labels: Sequence[Extremal], count: int, clearance: float) -> list[Extremal]:
@@ -65,7 +42,7 @@ def compare(
     dt: float = 0.02,
     disturbance: Disturbance = Disturbance(),
     clearance: float = CLEARANCE,
-) -> list[OnlineRow]:
+) -> list[dict[str, Any]]:
     """Play every start of the labels with both controllers.
 
     Args:
@@ -79,35 +56,24 @@ def compare(
         clearance: what the label must keep for its start to count, in the unit of the game's constraint.
 
     Returns:
-        One line per type, and a last one for all of them.
+        One line per type and a last one, of theta None, for all of them: the `Outcome` of each of `CONTROLLERS`, and
+        the counts of `SOLVES`.
     """
     solver = RecedingHorizon(game, interval)
     learned, online = (play(game, controller, labels, dt, disturbance) for controller in (policy, solver))
     rows = torch.arange(len(solver.solves)).split([len(found.status) for found in labels])
-    lines = [
-        _row(game, tuple(map(float, theta)), found, played, solver, index, clearance)
-        for theta, found, *played, index in zip(types, labels, learned, online, rows, strict=True)
+    sets = list(zip(labels, learned, online, rows, strict=True))
+    whole, ours = together(labels, learned)
+    sets.append((whole, ours, together(labels, online)[1], torch.cat(rows)))
+    return [
+        {
+            "theta": None if theta is None else tuple(map(float, theta)),
+            "policy": outcome(game, found, played, clearance)._asdict(),
+            "solver": outcome(game, found, solved, clearance)._asdict(),
+            "solves": {name: int(getattr(solver, name)[index].sum()) for name in SOLVES},
+        }
+        for theta, (found, played, solved, index) in zip([*types, None], sets, strict=True)
     ]
-    whole = [together(labels, episodes)[1] for episodes in (learned, online)]
-    return [*lines, _row(game, None, join(labels), whole, solver, torch.cat(rows), clearance)]
-
-
-def _row(
-    game: Game,
-    theta: tuple[float, ...] | None,
-    labels: Extremal,
-    played: Sequence[Trajectory],
-    solver: RecedingHorizon,
-    rows: Tensor,
-    clearance: float,
-) -> OnlineRow:
-    learned, online = (outcome(game, labels, episodes, clearance) for episodes in played)
-    counts = (int(count[rows].sum()) for count in (solver.solves, solver.searches, solver.failures))
-    return OnlineRow(theta, learned, online, SolverCounts(*counts))
-
-
-CONTROLLERS = {"policy": "learned", "solver": "solved online"}
-"""Names of the two controllers in results.json and in tables."""
 
 
 @sections.register("online")
@@ -119,33 +85,28 @@ class Online(ModelSection):
     columns = (
         Column("theta", "theta", format=text.types),
         Column("controller", "controller"),
-        Column("safe_starts", "starts", format=text.whole),
-        Column("collisions", "collisions", format=text.whole),
-        Column("rate", "rate", format=text.percent),
-        Column("interval", "95 % interval", format=text.interval),
+        COUNTS[0]._replace(heading="starts"),
+        *COUNTS[1:],
         Column("median_excess_cost", "excess cost", format=text.number),
         Column("solves", "solves", format=lambda solves: " / ".join(map(str, solves.values()))),
     )
 
     def compute(self, evaluation: Evaluation) -> dict[str, Any]:
         """Both controllers on the first `online` safe starts of every type, and the latency of both."""
-        options, game, dt = evaluation.options, evaluation.game, evaluation.dt
-        count, every = options["online"], options["online_interval"]
+        game, policy, dt, clearance = evaluation.game, evaluation.policy, evaluation.dt, evaluation.clearance
+        count, every = evaluation.options["online"], evaluation.options["online_interval"]
         content = {"starts_per_type": count, "interval": every, "dt": dt, "table": [], "latency": None}
-        chosen = safe_starts(evaluation.labels, count, evaluation.clearance)
+        chosen = safe_starts(evaluation.labels, count, clearance)
         total = sum(len(found.status) for found in chosen)
         if total == 0:
             return content | {"reason": "no start has a safe equilibrium"}
         log.info("Playing %d starts by solving the rest of the game every %g s.", total, every * dt)
-        disturbance, clearance = evaluation.condition.disturbance, evaluation.clearance
-        rows = compare(game, evaluation.policy, chosen, evaluation.types, every, dt, disturbance, clearance)
-        learned = latency(game, lambda: evaluation.policy, chosen, dt=dt)
+        disturbance = evaluation.condition.disturbance
+        table = compare(game, policy, chosen, evaluation.types, every, dt, disturbance, clearance)
+        learned = latency(game, lambda: policy, chosen, dt=dt)
         online = latency(game, lambda: RecedingHorizon(game, every), chosen, every, dt)
-        return content | {
-            "table": [row.content() for row in rows],
-            "latency": {"policy": learned.content(), "solver": online.content()},
-            "reason": None,
-        }
+        spent = {"policy": learned._asdict(), "solver": online._asdict()}
+        return content | {"table": table, "latency": spent, "reason": None}
 
     def rows(self, content: Mapping[str, Any]) -> list[dict[str, Any]]:
         """Two lines per type, one of each controller."""

@@ -22,7 +22,7 @@ class Outcome(NamedTuple):
     """What came of some episodes; numbers that do not exist or are not finite are None.
 
     A start counts if its equilibrium is safe: it keeps a stated clearance. All numbers but the first five are over
-    these starts.
+    these starts. There is a field for every entry that results.json has of them, hence so many.
     """
 
     starts: int
@@ -60,18 +60,14 @@ class Outcome(NamedTuple):
 
 
 def outcome(game: Game, labels: Extremal, played: Trajectory, clearance: float) -> Outcome:
-    """What came of episodes that were played from the starts of labels.
+    """What came of episodes that were played from the starts of labels, B rows of each.
 
-    Args:
-        game: the game.
-        labels: B rows.
-        played: the episodes from the same starts, B rows.
-        clearance: what the label must keep for its start to count, in the unit of the game's constraint.
+    A start counts if its label keeps the clearance, which is in the unit of the game's constraint.
     """
     counted, near = safe(labels, clearance), marginal(labels, clearance)
     count, collisions = int(counted.sum()), int((played.collided & counted).sum())
-    excess = excess_costs(labels, played)[counted]
-    distances = finite(quantiles(played.distance[counted], SHARES))
+    excess = (labels.value[:, 0] - played.value.double())[counted]
+    distances = _finite(quantiles(played.distance[counted], SHARES))
     return Outcome(
         starts=len(labels.status),
         unsolved=int((labels.status != Status.CONVERGED).sum()),
@@ -84,22 +80,12 @@ def outcome(game: Game, labels: Extremal, played: Trajectory, clearance: float) 
         interval=clopper_pearson(collisions, count),
         median_min_distance=None if distances is None else distances[-1],
         distance_quantiles=distances,
-        median_excess_cost=median(excess.sum(-1)),
+        median_excess_cost=_median(excess.sum(-1)),
         largest_excess_cost=_single(excess.sum(-1).max()) if count else None,
-        median_excess_costs=finite(excess.median(0).values) if count else None,
-        median_label_cost=median(joint_cost(labels)[counted]),
+        median_excess_costs=_finite(excess.median(0).values) if count else None,
+        median_label_cost=_median(labels.cost[counted]),
         saturated=saturated_share(played.u[counted], game.control_box),
     )
-
-
-def excess_costs(labels: Extremal, played: Trajectory) -> Tensor:
-    """Each player's cost above the label's, (B, P)."""
-    return labels.value[:, 0] - played.value.double()
-
-
-def joint_cost(labels: Extremal) -> Tensor:
-    """Sum of all players' costs in the equilibrium, (B,)."""
-    return -labels.value[:, 0].sum(-1)
 
 
 def together(labels: Sequence[Extremal], played: Sequence[Trajectory]) -> tuple[Extremal, Trajectory]:
@@ -108,7 +94,7 @@ def together(labels: Sequence[Extremal], played: Sequence[Trajectory]) -> tuple[
     return join(labels), Trajectory(played[0].t, *(torch.cat(column) for column in columns))
 
 
-def median(values: Tensor) -> float | None:
+def _median(values: Tensor) -> float | None:
     """The lower median; None without numbers, or where it is not finite."""
     return _single(values.median()) if len(values) else None
 
@@ -117,7 +103,7 @@ def _single(value: Tensor) -> float | None:
     return float(value) if bool(value.isfinite()) else None
 
 
-def finite(values: Tensor) -> tuple[float, ...] | None:
+def _finite(values: Tensor) -> tuple[float, ...] | None:
     """Numbers as they are stored, (N,); None if one is not finite."""
     return tuple(values.tolist()) if bool(values.isfinite().all()) else None
 
@@ -145,11 +131,14 @@ def pooled(rows: Sequence[Mapping[str, Any]]) -> Pooled:
     """Outcomes by type in one line.
 
     Args:
-        rows: "theta" and the entries of an `Outcome` for each type, such as the rows of results.json's `table`.
+        rows: "theta", the counts and, if costs are asked for, the median costs of an `Outcome` for each type, such as
+            the rows of results.json's `table`.
     """
-    collisions, count = (sum(row[name] for row in rows) for name in ("collisions", "safe_starts"))
     played = [row for row in rows if row["safe_starts"]]
+    collisions, count = (sum(row[name] for row in played) for name in ("collisions", "safe_starts"))
     worst = max(played, key=lambda row: row["collisions"] / row["safe_starts"], default=None)
+    costs = [(row.get("median_excess_cost"), row.get("median_label_cost")) for row in played]
+    ratios = [above / abs(cost) for above, cost in costs if above is not None and cost]
     return Pooled(
         collisions=collisions,
         safe_starts=count,
@@ -157,12 +146,5 @@ def pooled(rows: Sequence[Mapping[str, Any]]) -> Pooled:
         interval=clopper_pearson(collisions, count),
         worst_theta=tuple(worst["theta"]) if worst is not None and collisions else None,
         worst_rate=None if worst is None else worst["collisions"] / worst["safe_starts"],
-        relative_excess=_relative_excess(played),
+        relative_excess=statistics.median(ratios) if ratios else None,
     )
-
-
-def _relative_excess(rows: Sequence[Mapping[str, Any]]) -> float | None:
-    """None where no type has both costs."""
-    costs = [(row.get("median_excess_cost"), row.get("median_label_cost")) for row in rows]
-    ratios = [above / abs(cost) for above, cost in costs if above is not None and cost]
-    return statistics.median(ratios) if ratios else None

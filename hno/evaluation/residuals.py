@@ -21,13 +21,13 @@ from hno.types import Extremal, Points, Sample, Status
 
 REGIONS = ("start box", "PDE box", "constraint band", "around labels", "along labels")
 """Uniform starts at the beginning; uniform in the PDE box; near the surface constraint = 0; nodes of labels with noise,
-as the sampler of collocation points makes them (`hno.data.sampling`); the nodes themselves."""
+as the sampler of collocation points makes them (`hno.data.sources`); the nodes themselves."""
 BINS = 4
 """Equal parts of the horizon by which residuals are reported."""
 
 
 class ResidualRow(NamedTuple):
-    """The HJI residual at one type in one region; numbers that do not exist are None."""
+    """The HJI residual of one type in one region, a field for every entry of results.json; None where it is missing."""
 
     theta: tuple[float, ...]
     """Player types."""
@@ -69,12 +69,13 @@ def residual_table(
         seed: of the points, which are the same whatever other types there are.
         bins: of time to go.
     """
-    known = {tuple(float(t) for t in theta) for theta in seen}
-    return [
-        _row(operator, tuple(float(t) for t in found.theta[0]), known, region, where, bins)
-        for found in labels
-        for region, where in zip(REGIONS, _regions(operator.game, found, points, seed), strict=True)
-    ]
+    known = {tuple(map(float, theta)) for theta in seen}
+    rows = list[ResidualRow]()
+    for found in labels:
+        theta = tuple(found.theta[0].tolist())
+        for region, where in zip(REGIONS, _regions(operator.game, found, points, seed), strict=True):
+            rows.append(ResidualRow(theta, theta in known, region, len(where.tau), *_means(operator, where, bins)))
+    return rows
 
 
 def _regions(game: Game, found: Extremal, size: int, seed: int) -> Iterator[Points]:
@@ -98,29 +99,17 @@ def _regions(game: Game, found: Extremal, size: int, seed: int) -> Iterator[Poin
         yield from (nothing, nothing)
 
 
-def _row(
-    operator: ValueOperator,
-    theta: tuple[float, ...],
-    seen: set[tuple[float, ...]],
-    region: str,
-    where: Points,
-    bins: int,
-) -> ResidualRow:
+def _means(operator: ValueOperator, where: Points, bins: int) -> tuple[Any, ...]:
+    """The fields of a `ResidualRow` after `points`."""
     horizon = operator.game.horizon
     place = (where.tau / horizon * bins).long().clamp(0, bins - 1)
     residual, scale = hji(operator, where) if len(where.tau) > 0 else (where.theta, where.theta)
-    scaled = residual / scale
-    return ResidualRow(
-        theta=theta,
-        seen=theta in seen,
-        region=region,
-        points=len(where.tau),
-        physical=_number(residual.abs().double().mean()),
-        scaled=_number(scaled.abs().double().mean()),
-        tau=tuple(horizon * k / bins for k in range(bins + 1)),
-        points_by_tau=tuple(torch.bincount(place, minlength=bins).tolist()),
-        physical_by_tau=tuple(map(_number, binned_mean(residual, place, bins))),
-        scaled_by_tau=tuple(map(_number, binned_mean(scaled, place, bins))),
+    kinds = residual, residual / scale
+    return (
+        *(_numbers(kind.abs().double().mean()) for kind in kinds),
+        tuple(horizon * k / bins for k in range(bins + 1)),
+        tuple(torch.bincount(place, minlength=bins).tolist()),
+        *(_numbers(binned_mean(kind, place, bins)) for kind in kinds),
     )
 
 
@@ -133,8 +122,11 @@ def hji(operator: ValueOperator, points: Points) -> tuple[Tensor, Tensor]:
     return residual, term.scale(view).expand_as(residual)
 
 
-def _number(value: Tensor) -> float | None:
-    return None if bool(value.isnan()) else float(value)
+def _numbers(values: Tensor) -> Any:
+    """A number, or a tuple of them, with None for NaN."""
+    if values.dim():
+        return tuple(map(_numbers, values))
+    return None if bool(values.isnan()) else float(values)
 
 
 @sections.register("residuals")
@@ -157,38 +149,32 @@ class Residuals(ModelSection):
 
     def compute(self, evaluation: Evaluation) -> list[dict[str, Any]]:
         """One line per type and region."""
-        seed = evaluation.condition.disturbance.seed
-        rows = residual_table(evaluation.operator, evaluation.labels, evaluation.seen, seed=seed)
+        operator, seed = evaluation.policy.operator, evaluation.options["seed"]
+        rows = residual_table(operator, evaluation.labels, evaluation.seen, seed=seed)
         return [row._asdict() for row in rows]
 
     def rows(self, content: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         """One line per region for the seen types and one for the unseen ones."""
-        groups: dict[tuple[str, bool], list[Mapping[str, Any]]] = {}
-        for row in content:
-            groups.setdefault((row["region"], row["seen"]), []).append(row)
         regions = list(dict.fromkeys(row["region"] for row in content))
-        ordered = sorted(groups.items(), key=lambda group: (regions.index(group[0][0]), not group[0][1]))
-        return [
-            {
-                "region": region,
-                "types": f"{len(same)} {'seen' if seen else 'unseen'}",
-                "points": sum(row["points"] for row in same),
-                **{name: _weighted(same, name, "points") for name in ("physical", "scaled")},
-                "scaled_by_tau": _weighted_bins(same),
-            }
-            for (region, seen), same in ordered
-        ]
+        groups = [(region, seen) for region in regions for seen in (True, False)]
+        found = [(*group, [row for row in content if (row["region"], row["seen"]) == group]) for group in groups]
+        return [_together(*group) for group in found if group[-1]]
 
 
-def _weighted_bins(rows: Sequence[Mapping[str, Any]]) -> list[float | None]:
-    """Means of the scaled residual over all points of each bin."""
-    names = ("scaled_by_tau", "points_by_tau")
-    bins = [dict(zip(names, pair, strict=True)) for row in rows for pair in zip(*map(row.get, names), strict=True)]
-    count = len(rows[0]["points_by_tau"])
-    return [_weighted(bins[place::count], *names) for place in range(count)]
+def _together(region: str, seen: bool, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """The line of several types: means over all of their points."""
+    counts = [row["points"] for row in rows]
+    bins = (zip(*(row[name] for row in rows), strict=True) for name in ("scaled_by_tau", "points_by_tau"))
+    return {
+        "region": region,
+        "types": f"{len(rows)} {'seen' if seen else 'unseen'}",
+        "points": sum(counts),
+        **{name: _weighted([row[name] for row in rows], counts) for name in ("physical", "scaled")},
+        "scaled_by_tau": [_weighted(*pair) for pair in zip(*bins, strict=True)],
+    }
 
 
-def _weighted(rows: Sequence[Mapping[str, Any]], name: str, count: str) -> float | None:
+def _weighted(means: Sequence[float | None], counts: Sequence[int]) -> float | None:
     """Mean over everything that several means are over; None where there is nothing."""
-    pairs = [(row[name], row[count]) for row in rows if row[name] is not None and row[count]]
-    return sum(value * size for value, size in pairs) / sum(size for _, size in pairs) if pairs else None
+    pairs = [(mean, count) for mean, count in zip(means, counts, strict=True) if mean is not None and count]
+    return sum(mean * count for mean, count in pairs) / sum(count for _, count in pairs) if pairs else None

@@ -10,20 +10,21 @@ import abc
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple
 
-from hno.control.rollout import Player
-from hno.evaluation.conditions import Condition
-from hno.evaluation.format import NOT_AVAILABLE
+from hno.control import Feedback
+from hno.evaluation import format as text
+from hno.evaluation.conditions import Condition, table_condition
 from hno.games import Game
-from hno.operators import ValueOperator
 from hno.registry import Registry
 from hno.types import Extremal, Trajectory
 
 sections: Registry[Section] = Registry("section", "hno.evaluation")
+Type = tuple[float, ...]
+"""Types of all players."""
 
 
 def plain(value: Any) -> str:
     """Any value as text; "n/a" for None."""
-    return NOT_AVAILABLE if value is None else str(value)
+    return text.NOT_AVAILABLE if value is None else str(value)
 
 
 class Column(NamedTuple):
@@ -32,7 +33,6 @@ class Column(NamedTuple):
     name: str
     """Entry of a row that it shows."""
     heading: str
-    """Above the column."""
     unit: str = ""
     """Of its numbers; empty where they have none, or their text names it."""
     format: Callable[[Any], str] = plain
@@ -44,27 +44,28 @@ class Column(NamedTuple):
         return f"{self.heading}, {self.unit}" if self.unit else self.heading
 
 
+COUNTS = (
+    Column("safe_starts", "safe starts", format=text.whole),
+    Column("collisions", "collisions", format=text.whole),
+    Column("rate", "rate", format=text.percent),
+    Column("interval", "95 % interval", format=text.interval),
+)
+"""Columns of an `hno.evaluation.outcome.Outcome`."""
+
+
 class Evaluation(NamedTuple):
-    """One model and the conditions under which it is evaluated."""
+    """One model and how it is evaluated."""
 
     name: str
     """Path of its checkpoint."""
-    operator: ValueOperator
-    """Its value function."""
-    policy: Player
-    """Its feedback controls of all players."""
-    seen: Sequence[tuple[float, ...]]
+    policy: Feedback
+    """Its feedback controls of all players, and its value function."""
+    seen: Sequence[Type]
     """Types that it was trained with."""
-    types: Sequence[tuple[float, ...]]
+    types: Sequence[Type]
     """Types that are evaluated."""
-    condition: Condition
-    """Of the starts and the episodes."""
-    clearance: float
-    """What a label must keep for its start to count, in the unit of the game's constraint."""
-    dt: float
-    """Time for which a control is held, s."""
     options: Mapping[str, Any]
-    """Entries of the configuration, for those of a section's own."""
+    """Entries of the configuration."""
     solve: Callable[[Condition], Sequence[Extremal]]
     """Labels of the starts of a condition, one set per type."""
     labels: Sequence[Extremal] = ()
@@ -75,7 +76,22 @@ class Evaluation(NamedTuple):
     @property
     def game(self) -> Game:
         """The game."""
-        return self.operator.game
+        return self.policy.game
+
+    @property
+    def clearance(self) -> float:
+        """What a label must keep for its start to count, in the unit of the game's constraint."""
+        return float(self.options["clearance"])
+
+    @property
+    def dt(self) -> float:
+        """Time for which a control is held, s."""
+        return float(self.options["dt"])
+
+    @property
+    def condition(self) -> Condition:
+        """Of the starts and the episodes."""
+        return table_condition(self.game, self.options)
 
 
 class Section(abc.ABC):
@@ -86,19 +102,13 @@ class Section(abc.ABC):
     note: ClassVar[str] = ""
     """What the columns mean, where their headings do not say it."""
     columns: ClassVar[tuple[Column, ...]]
-    """From left to right."""
 
     @abc.abstractmethod
     def rows(self, content: Any) -> Sequence[Mapping[str, Any]]:
         """Lines of the table, each with an entry for every column, from the section's content of results.json."""
 
     def remarks(self, content: Any, results: Mapping[str, Any]) -> list[str]:
-        """Sentences below the table.
-
-        Args:
-            content: see `rows`.
-            results: the other entries of results.json, such as `clearance` and `constraint_unit`.
-        """
+        """Sentences below the table; `results` has the other entries of results.json, such as `clearance`."""
         return []
 
 

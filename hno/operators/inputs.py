@@ -58,8 +58,8 @@ class Encoding(nn.Module):
         """Gradient in y (B, P, `Inputs.total`) -> derivative in time to go, 1/s, (B, P)."""
         return gradient[..., 0] * (2 / self.game[0].horizon)
 
-    def state_slope(self, gradient: Tensor, x: Tensor) -> Tensor:
-        """Gradient in y (B, P, `Inputs.total`) -> derivative of every player in every state, (B, P, P, n)."""
+    def state_slope(self, gradient: Tensor, x: Tensor, size: Tensor) -> Tensor:
+        """Gradient in y (B, P, `Inputs.total`) -> `size` times the derivative in every state, (B, P, P, n)."""
         (game,) = self.game
         sizes, own = self.sizes, gradient[..., None, 1 : 1 + self.features]
         others = gradient[..., sizes.ego : sizes.total - sizes.role].unflatten(-1, (sizes.others, sizes.other))
@@ -70,7 +70,7 @@ class Encoding(nn.Module):
             angle = math.pi * game.state_box.scale(x)[..., self.periodic].unsqueeze(-3)
             turned = scaled[..., self.periodic] * angle.cos() - slope[..., game.state_dim :] * angle.sin()
             scaled = scaled.index_copy(-1, torch.tensor(self.periodic, device=x.device), math.pi * turned)
-        return scaled * (2 / game.state_box.width)
+        return scaled * (2 * size / game.state_box.width)
 
 
 def ego_views(x: Tensor, *, inverse: bool = False) -> Tensor:

@@ -29,15 +29,12 @@ class CheckpointError(RuntimeError):
 
 @dataclass(frozen=True)
 class Provenance:
-    """Where an operator comes from."""
+    """Where an operator comes from: its method, its training types, and the hash of what determined its numbers."""
 
     method: str = ""
-    """Name of its list of loss terms, such as "hno"."""
     types: Sequence[tuple[float, ...]] = ()
-    """Player types that it was trained with."""
     seed: int | None = None
     config_hash: str = ""
-    """Of what determined the run's numbers."""
 
 
 def record(game: Game, architecture: Architecture, provenance: Provenance) -> dict[str, Any]:
@@ -90,11 +87,7 @@ _ENTRIES = {"game", "constants", "fingerprint", "architecture", "provenance"}
 
 
 def check_resumable(path: str | Path, expected: Mapping[str, Any]) -> None:
-    """Refuse to resume from a checkpoint whose record differs.
-
-    Args:
-        path: the checkpoint.
-        expected: what `record` gives for the run that is to go on.
+    """Refuse to resume from a checkpoint whose record is not the expected one, as `record` gives it.
 
     Raises:
         CheckpointError: see `read_checkpoint`; or the checkpoint is of another game, operator or configuration.
@@ -117,9 +110,7 @@ def _flat(content: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 def load_operator(path: str | Path, game: str | None = None) -> tuple[ValueOperator, Architecture, Provenance]:
     """The trained operator in a checkpoint, in evaluation mode, what it is built of and where it comes from.
 
-    Args:
-        path: a checkpoint that training wrote.
-        game: the name of the game that it must be of; any, by default.
+    Where a game is named, it must be of that one.
 
     Raises:
         CheckpointError: see `read_checkpoint`; or the checkpoint is of another game, or its game has changed since.

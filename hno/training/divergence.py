@@ -8,9 +8,14 @@ from typing import Any
 import lightning as L
 import torch
 
+ERROR = "val/costate_error"
+
 
 class DivergedError(RuntimeError):
-    """The training loss is no longer finite."""
+    """The loss, the error on held-out labels or a weight is no longer sound; `what` says which."""
+
+    def __init__(self, what: str) -> None:
+        super().__init__(f"{what}: the training diverged. Lower optimizer.lr or set trainer.gradient_clip_val.")
 
 
 class StopOnDivergence(L.Callback):
@@ -33,9 +38,7 @@ class StopOnDivergence(L.Callback):
         """Test the loss of this step."""
         last = trainer.global_step == trainer.max_steps
         if (trainer.global_step % self.every == 0 or last) and not bool(torch.isfinite(outputs["loss"])):
-            raise DivergedError(
-                f"The loss is {float(outputs['loss'])} at step {trainer.global_step}: the training diverged. {_ADVICE}"
-            )
+            raise DivergedError(f"The loss is {float(outputs['loss'])} at step {trainer.global_step}")
 
     def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Test the error of costates on held-out labels."""
@@ -43,10 +46,7 @@ class StopOnDivergence(L.Callback):
         self.smallest = min(self.smallest, error)
         if not (math.isfinite(error) and error <= self.growth * self.smallest):
             was = f"; it was {self.smallest:.3g}" if self.smallest < math.inf else ""
-            raise DivergedError(
-                f"The error of costates is {error:.3g} at step {trainer.global_step}{was}: the training diverged. "
-                f"{_ADVICE}"
-            )
+            raise DivergedError(f"The error of costates is {error:.3g} at step {trainer.global_step}{was}")
 
     def state_dict(self) -> dict[str, Any]:
         """The smallest error so far."""
@@ -59,15 +59,9 @@ class StopOnDivergence(L.Callback):
     def on_exception(self, trainer: L.Trainer, pl_module: L.LightningModule, exception: BaseException) -> None:
         """Say what it means that an optimiser cannot factorise its statistics: a gradient was not finite."""
         if isinstance(exception, torch.linalg.LinAlgError):  # type: ignore[attr-defined]  # public, not in __all__
-            raise DivergedError(
-                f"The optimiser failed at step {trainer.global_step}: the training diverged. {_ADVICE}"
-            ) from exception
+            raise DivergedError(f"The optimiser failed at step {trainer.global_step}") from exception
 
     def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Test the weights, which the last step changed after its loss."""
         if not all(bool(weights.isfinite().all()) for weights in pl_module.parameters()):
-            raise DivergedError(f"The last step left weights that are not finite: the training diverged. {_ADVICE}")
-
-
-ERROR = "val/costate_error"
-_ADVICE = "Lower optimizer.lr or set trainer.gradient_clip_val."
+            raise DivergedError("The last step left weights that are not finite")

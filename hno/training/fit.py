@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import lightning as L
-from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.callbacks import ModelCheckpoint, ProgressBar
 from lightning.pytorch.loggers import Logger
 
 from hno.data import GameData
@@ -34,7 +34,7 @@ LONG = 20_000
 
 @dataclass(frozen=True)
 class Settings:
-    """How an operator is trained."""
+    """How an operator is trained: a field for every choice, all with defaults."""
 
     steps: int = 2000
     optimizer: Mapping[str, Any] = field(default_factory=lambda: {"name": "soap"})
@@ -103,7 +103,7 @@ def fit(
         DivergedError: the loss, or the error on held-out labels, is no longer sound.
     """
     optimizer = make_optimizer(steps=settings.steps, **settings.optimizer)
-    module = TrainingModule(operator, objective, optimizer, record=lambda: dict(record or {}))
+    module = TrainingModule(operator, objective, optimizer, record)
     if settings.compile and settings.steps >= LONG:
         operator.compile_kernels()
     data.setup("fit")
@@ -121,8 +121,8 @@ def fit(
     # The callback saves at multiples of `validate_every`, which the last step need not be.
     trainer.save_checkpoint(folder / LAST, weights_only=False)
     seconds = {"training": time.perf_counter() - began - watch.seconds, "validation": watch.seconds}
-    losses = {name: float(value) for name, value in trainer.callback_metrics.items() if name.startswith("loss/")}
-    metrics = {name: loss for name, loss in losses.items() if not math.isnan(loss)}
+    logged = {name: float(value) for name, value in trainer.callback_metrics.items() if name.startswith("loss/")}
+    metrics = {name: loss for name, loss in logged.items() if not math.isnan(loss)}
     if data.val_rows is not None:
         metrics |= trainer.validate(module, datamodule=data, verbose=False)[0]
     checkpoint = folder / (BEST if (folder / BEST).exists() else LAST)
@@ -134,7 +134,9 @@ def make_trainer(
 ) -> L.Trainer:
     """A trainer that runs for a number of steps and leaves `last.ckpt` in the folder."""
     every = settings.validate_every
-    progress = [callback for callback in callbacks if isinstance(callback, L.pytorch.callbacks.ProgressBar)]
+    keeping_last = ModelCheckpoint(
+        folder, Path(LAST).stem, every_n_train_steps=every, save_on_train_epoch_end=False, enable_version_counter=False
+    )
     return L.Trainer(
         accelerator=settings.accelerator,
         devices=settings.devices,
@@ -147,20 +149,9 @@ def make_trainer(
         num_sanity_val_steps=0,
         log_every_n_steps=max(1, min(50, settings.steps)),
         logger=list(loggers) or False,
-        callbacks=[StopOnDivergence(min(50, every)), *callbacks, _checkpoints(folder, every)],
-        enable_progress_bar=bool(progress),
+        callbacks=[StopOnDivergence(min(50, every)), *callbacks, keeping_last],
+        enable_progress_bar=any(isinstance(callback, ProgressBar) for callback in callbacks),
         enable_model_summary=False,
         default_root_dir=folder,
         inference_mode=False,
-    )
-
-
-def _checkpoints(folder: Path, every: int) -> ModelCheckpoint:
-    """Keep `last.ckpt` in the folder, written every so many steps."""
-    return ModelCheckpoint(
-        dirpath=folder,
-        filename=Path(LAST).stem,
-        every_n_train_steps=every,
-        save_on_train_epoch_end=False,
-        enable_version_counter=False,
     )

@@ -26,7 +26,7 @@ class TrainingModule(L.LightningModule):
         operator: what is trained.
         objective: loss terms and weights.
         optimizer: needed for training only.
-        record: called as a checkpoint is written; its entries are added to it.
+        record: entries that are added to checkpoints.
     """
 
     def __init__(
@@ -34,10 +34,10 @@ class TrainingModule(L.LightningModule):
         operator: ValueOperator,
         objective: Objective,
         optimizer: Optimizer | None = None,
-        record: Callable[[], Mapping[str, Any]] = dict,
+        record: Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__()
-        self.operator, self.objective, self.optimizer, self.record = operator, objective, optimizer, record
+        self.operator, self.objective, self.optimizer, self.record = operator, objective, optimizer, record or {}
         self.terms = objective.used(exact_terminal=operator.meets_terminal)
         self.value_error = WeightedMeanAbsolutePercentageError()
         self.costate_error = WeightedMeanAbsolutePercentageError()
@@ -63,14 +63,13 @@ class TrainingModule(L.LightningModule):
         points = Points(*(torch.cat(parts) for parts in zip(*(s.points for s in kept.values()), strict=True)))
         types = tables([sample.types or distinct_types(sample.points.theta) for sample in kept.values()])
         sizes = [sample.size for sample in kept.values()]
-        reduced: dict[str, list[Tensor]] = {name: [] for name in read}
+        reduced = list[list[Tensor]]()
         for member in self.operator.members:
             columns = (part.split(sizes) for part in member(points, types))
             fields = dict(zip(kept, (Field(*parts) for parts in zip(*columns, strict=True)), strict=True))
-            for name, stream in read.items():
-                view = self._view(kept[stream], fields[stream], member)
-                reduced[name].append(self.objective.reduced(name, view))
-        return {name: torch.stack(each).mean() for name, each in reduced.items()}
+            views = {stream: self._view(kept[stream], fields[stream], member) for stream in kept}
+            reduced.append([self.objective.reduced(name, views[stream]) for name, stream in read.items()])
+        return {name: torch.stack(each).mean() for name, each in zip(read, zip(*reduced, strict=True), strict=True)}
 
     def _view(self, sample: Sample, field: Field, member: FieldFunction) -> View:
         operator = self.operator
@@ -100,7 +99,7 @@ class TrainingModule(L.LightningModule):
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Add the record."""
-        checkpoint.update(self.record())
+        checkpoint.update(self.record)
 
     def configure_optimizers(self) -> Any:
         """What the `optimizer` argument builds."""

@@ -23,20 +23,9 @@ def muon(
     weight_decay: float = 0.0,
     adamw_lr: float = 3e-3,
 ) -> torch.optim.Optimizer:
-    """Muon for matrices, AdamW for biases and slopes.
-
-    Args:
-        parameters: of the net.
-        lr: learning rate of matrices.
-        momentum: of matrices.
-        ns_steps: Newton-Schulz iterations of the orthogonalisation.
-        weight_decay: of matrices.
-        adamw_lr: learning rate of everything else.
-    """
-    matrices, others = list[nn.Parameter](), list[nn.Parameter]()
-    for parameter in parameters:
-        (matrices if parameter.dim() >= 2 else others).append(parameter)
-    groups = [{"params": matrices, "use_muon": True}, {"params": others, "use_muon": False}]
+    """Muon for matrices, with `ns_steps` Newton-Schulz iterations; AdamW at rate `adamw_lr` for biases and slopes."""
+    known = list(parameters)
+    groups = [{"params": [p for p in known if (p.dim() >= 2) == use], "use_muon": use} for use in (True, False)]
     return Muon(groups, lr, momentum, weight_decay, ns_steps=ns_steps, adamw_lr=adamw_lr)
 
 
@@ -72,21 +61,15 @@ def make_optimizer(
         raise UnknownNameError(unknown_name("schedule", schedule, list(SCHEDULES)))
     check_options(f"optimizer {name}", factory, options, skip=OWN)
 
+    def factor(step: int) -> float:
+        """By which every group's rate is multiplied: 1 at the first step, the end's share after the last."""
+        done, end = min(step / steps, 1.0), final_lr / lr
+        return end + (1 - end) * ((1 + math.cos(math.pi * done)) / 2 if schedule == "cosine" else 1 - done)
+
     def build(parameters: Iterable[nn.Parameter]) -> dict[str, Any]:
         optimizer = factory(parameters, lr=lr, **options)
         if schedule == "constant":
             return {"optimizer": optimizer}
-        falling = _falling(optimizer, steps, final_lr / lr, schedule)
-        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": falling, "interval": "step"}}
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": LambdaLR(optimizer, factor), "interval": "step"}}
 
     return build
-
-
-def _falling(optimizer: torch.optim.Optimizer, steps: int, end: float, schedule: str) -> LambdaLR:
-    """A schedule that multiplies every group's rate by 1 at the first step and by `end` after the last."""
-
-    def factor(step: int) -> float:
-        done = min(step / steps, 1.0)
-        return end + (1 - end) * ((1 + math.cos(math.pi * done)) / 2 if schedule == "cosine" else 1 - done)
-
-    return LambdaLR(optimizer, factor)

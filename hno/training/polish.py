@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -24,22 +25,19 @@ def polish(module: TrainingModule, batch: Batch, iterations: int) -> tuple[float
     """
     operator = module.operator
     weights = copy.deepcopy(operator.state_dict())
-    optimizer = torch.optim.LBFGS(
-        operator.parameters(), max_iter=iterations, history_size=30, line_search_fn="strong_wolfe"
-    )
+    settings: dict[str, Any] = {"max_iter": iterations, "history_size": 30, "line_search_fn": "strong_wolfe"}
+    optimizer = torch.optim.LBFGS(operator.parameters(), **settings)
 
     def loss() -> Tensor:
-        return module.objective.total(module.losses(batch))
-
-    def closure() -> float:
         optimizer.zero_grad()
-        total = loss()
-        total.backward()
-        return float(total.detach())
+        total = module.objective.total(module.losses(batch))
+        if torch.is_grad_enabled():
+            total.backward()
+        return total.detach()
 
     with torch.no_grad():
         before = float(loss())
-    optimizer.step(closure)
+    optimizer.step(lambda: float(loss()))
     with torch.no_grad():
         after = float(loss())
     if not after <= before:

@@ -16,7 +16,7 @@ from hno.control.policy import Feedback
 from hno.control.rollout import rollout
 from hno.data import GameData
 from hno.training.module import TrainingModule
-from hno.types import Extremal, Trajectory, part
+from hno.types import Extremal, Trajectory, join, part
 
 log = logging.getLogger(__name__)
 
@@ -46,23 +46,18 @@ class Score(NamedTuple):
 
 
 class Later(NamedTuple):
-    """Validation starts whose labels are solved when they are first needed."""
+    """A number of validation starts whose labels, one set per type that has any, are solved when they are needed."""
 
     starts: int
-    """Their number."""
     solve: Callable[[], Sequence[Extremal]]
-    """Their labels, one set per type that has any."""
 
 
 class Starts(NamedTuple):
-    """Where validation episodes begin, and what their equilibria cost."""
+    """Where episodes begin (B, P, n), player types (B, P), and the joint cost of the equilibrium (B,)."""
 
     x0: Tensor
-    """(B, P, n)."""
     theta: Tensor
-    """(B, P)."""
     cost: Tensor
-    """Joint cost of the equilibrium, (B,)."""
 
     def like(self, tensor: Tensor) -> Starts:
         """The same in the type and on the device of a tensor."""
@@ -71,15 +66,14 @@ class Starts(NamedTuple):
 
 def starts_of(labels: Sequence[Extremal]) -> Starts:
     """Starts of labels, float32."""
-    x0, theta = (torch.cat(column).float() for column in zip(*((e.x[:, 0], e.theta) for e in labels), strict=True))
-    return Starts(x0, theta, torch.cat([-found.value[:, 0].sum(-1) for found in labels]).float())
+    whole = join(labels)
+    return Starts(whole.x[:, 0].float(), whole.theta.float(), whole.cost.float())
 
 
 def score(played: Trajectory, starts: Starts) -> Score:
-    """How good episodes are; a collision is whatever keeps no positive clearance, NaN too."""
-    excess = -played.value.sum(-1) - starts.cost
-    rate = (~(played.clearance > 0)).float().mean()
-    return Score(float(rate), float(excess.nan_to_num(torch.inf).median() / starts.cost.median().abs()))
+    """How good episodes are."""
+    excess = (played.cost - starts.cost).nan_to_num(torch.inf).median() / starts.cost.median().abs()
+    return Score(float(played.collided.float().mean()), float(excess))
 
 
 class ClosedLoopValidation(L.Callback):
@@ -106,9 +100,7 @@ class ClosedLoopValidation(L.Callback):
     def begin(self, labels: Sequence[Extremal], later: Later | None = None) -> None:
         """Play from the starts of these labels, which are safe, one set per type; without any, play nothing.
 
-        Args:
-            labels: of all starts, or of those that are played first.
-            later: all starts, where `labels` are the first of them; they are solved once none of these collides.
+        If there are `later` ones, these are the first of them, and the others are solved once none of these collides.
         """
         if not labels:
             log.info("No validation start has a safe equilibrium: there is no closed-loop validation.")
@@ -121,15 +113,11 @@ class ClosedLoopValidation(L.Callback):
     ) -> None:
         """Validate where it is time to."""
         assert isinstance(pl_module, TrainingModule)
-        step = trainer.global_step
-        if step % self.every and step != trainer.max_steps:
-            return
-        found = self.consider(trainer, pl_module)
-        if found is None:
-            return
-        pl_module.log_dict({"closed_loop/collision_rate": found.collision_rate, "closed_loop/excess": found.excess})
-        if self.stop and found.collision_rate == 0:
-            trainer.should_stop = True
+        due = trainer.global_step % self.every == 0 or trainer.global_step == trainer.max_steps
+        found = self.consider(trainer, pl_module) if due else None
+        if found is not None:
+            pl_module.log_dict({f"closed_loop/{name}": value for name, value in found._asdict().items()})
+            trainer.should_stop |= self.stop and found.collision_rate == 0
 
     def consider(self, trainer: L.Trainer, module: TrainingModule) -> Score | None:
         """Play, if there are starts, and write `best.ckpt` if nothing was better so far."""
@@ -137,8 +125,7 @@ class ClosedLoopValidation(L.Callback):
             return None
         began = time.perf_counter()
         found = self.play(trainer, module, self.all)
-        better = found.after(self.best)
-        if better is not None:
+        if better := found.after(self.best):
             self.best = better
             trainer.save_checkpoint(self.path, weights_only=False)
         self.seconds += time.perf_counter() - began

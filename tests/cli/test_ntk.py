@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 import torch
 
-from hno.evaluation.conditions import Condition
+from hno.control import Feedback
 from hno.evaluation.kernels import TangentKernel
 from hno.evaluation.sections import Evaluation
 from hno.evaluation.spectrum import spectrum, summary
@@ -86,8 +86,7 @@ def test_a_type_without_labels_says_why() -> None:
     labels = [failed, fake_labels(operator.game, (1.0, 5.0)), fake_labels(operator.game, (3.0, 3.0))]
     seen, types = [(1.0, 1.0), (1.0, 5.0)], [(1.0, 1.0), (1.0, 5.0), (3.0, 3.0)]
     evaluation = Evaluation(
-        "any", operator, lambda tau, x, theta: x, seen, types, Condition(), 0.02, 0.1, {"ntk_rows": 40},
-        lambda condition: labels, labels,
+        "any", Feedback(operator), seen, types, {"ntk_rows": 40, "seed": 0}, lambda condition: labels, labels,
     )  # fmt: skip
     section = TangentKernel().compute(evaluation)
     assert [(entry["theta"], entry["points"]) for entry in section] == [([1.0, 1.0], 0), ([1.0, 5.0], 2)]

@@ -8,8 +8,7 @@ import pytest
 import torch
 from rich.console import Console
 
-from hno.cli.tables import show_section
-from hno.evaluation.conditions import Condition
+from hno.cli.sections import show_section
 from hno.evaluation.online import Online
 from hno.evaluation.sections import Evaluation
 from hno.training.checkpoint import load_policy
@@ -58,20 +57,8 @@ def test_impossible_settings(command: Command, random_checkpoint: Path, override
 def test_without_a_safe_start_nothing_is_played(random_checkpoint: Path, capsys: pytest.CaptureFixture[str]) -> None:
     policy = load_policy(random_checkpoint)
     found = fake_labels(policy.game, (1.0, 1.0), 3, clearance=[-1.0] * 3, start=torch.zeros(3, 2, 4))
-    options, types = {"online": 2, "online_interval": 1}, [(1.0, 1.0)]
-    evaluation = Evaluation(
-        "any",
-        policy.operator,
-        policy,
-        types,
-        types,
-        Condition(),
-        0.02,
-        0.1,
-        options,
-        lambda condition: [found],
-        [found],
-    )
+    options, types = {"online": 2, "online_interval": 1, "clearance": 0.02, "dt": 0.1}, [(1.0, 1.0)]
+    evaluation = Evaluation("any", policy, types, types, options, lambda condition: [found], [found])
     section = Online().compute(evaluation)
     assert (section["table"], section["latency"]) == ([], None)
     show_section("online", section, {}, Console())

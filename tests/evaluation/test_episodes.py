@@ -109,7 +109,7 @@ def test_one_player_alone_has_episodes_without_a_radius() -> None:
 
 def test_where_the_constraint_is_no_distance_there_is_no_radius(sets: list[Extremal]) -> None:
     game = Walkers()
-    game.constraint_unit = ""
+    game.constraint_unit, game.distance_constraints = "", False
     kept = episodes(game, play(game, straight, sets, 0.02), sets, 0.02)
     assert kept["constraint_unit"] == ""
     assert all(episode["radius"] is None for episode in kept["episodes"])

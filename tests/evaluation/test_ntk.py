@@ -1,19 +1,24 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from hno.data.rows import NoLabelsError, rows_of
 from hno.evaluation import ntk
+from hno.evaluation.kernels import TangentKernel, type_entry
 from hno.evaluation.ntk import jacobian, points_per_block, residuals, rows_per_point, tangent_kernels, type_kernel
 from hno.evaluation.spectrum import spectrum
 from hno.games import make
 from hno.losses import Scales, View, losses
 from hno.operators import ValueOperator, make_operator
+from hno.operators.deeponet import MLP
+from hno.operators.gradient import GradientOperator
+from hno.operators.network import Inputs, Network
 from hno.types import Labels, Points, Sample, Status, join
 from tests.fakes import fake_labels, small_architecture
 
@@ -95,7 +100,10 @@ def test_rows_are_gradients_of_what_training_makes_small(game: str, exact: bool)
 
 def test_kernel_of_a_linear_net_is_known() -> None:
     """<W y + b, U a + c> has the kernels <B, B'> (<y, y'> + 1) and <T, T'> (<a, a'> + 1)."""
-    operator = small(depth=0)
+    operator = small(depth=1)
+    sizes, activation = operator.encoding.sizes, operator.networks[0].trunk.activation
+    operator.networks[0].trunk = MLP((sizes.total, 8), activation)
+    operator.networks[0].branch = MLP((sizes.sensors, 8), activation)
     sample = some_points(operator, 3)
     trunk, branch = tangent_kernels(operator, sample)
     each, players = rows_per_point(operator), operator.game.players
@@ -164,9 +172,9 @@ def test_type_kernel_has_the_sum_and_the_product_of_its_parts() -> None:
     found = type_kernel(operator, labels, rows=10**6)
     sample = rows_of(operator.game, [labels])
     trunk, branch = tangent_kernels(operator, sample.rows(sample.points.tau > 0))
-    assert found.theta == (1.3, 5.0)
     assert found.points == len(labels.t) - 1, "all but the end"
     close(found.kernel.eigenvalues, torch.linalg.eigvalsh(trunk + branch).flip(0))
+    assert found.product is not None
     close(found.product.eigenvalues, torch.linalg.eigvalsh(trunk * branch).flip(0))
 
 
@@ -193,3 +201,38 @@ def test_what_makes_no_kernel() -> None:
     operator.networks[0].trunk.activation.slope.data.fill_(float("nan"))
     with pytest.raises(ValueError, match="diverged"):
         type_kernel(operator, fake_labels(game), 40)
+
+
+class Parametric(Network):
+    """A network from outside, without trunk and branch: types beside times and states."""
+
+    def __init__(self, inputs: Inputs, activation: Callable[[], nn.Module]) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(nn.Linear(inputs.total + inputs.sensors, 8), nn.Tanh(), nn.Linear(8, 1))
+
+    def forward(self, y: Tensor, sensors: Tensor, which: Tensor) -> Tensor:
+        return self.layers(torch.cat([y, sensors[which]], -1)).squeeze(-1)
+
+
+@pytest.mark.parametrize("exact", [False, True])
+def test_a_network_without_trunk_and_branch_has_a_kernel_and_no_product(exact: bool) -> None:
+    torch.manual_seed(0)
+    operator = GradientOperator(make("narrow_road"), lambda inputs: Parametric(inputs, nn.Tanh), exact)
+    sample = some_points(operator)
+    dense = dense_jacobian(operator, sample)
+    (kernel,) = tangent_kernels(operator, sample, memory=1)
+    close(kernel, dense @ dense.mT)
+    labels = fake_labels(operator.game, (1.3, 5.0), 1)
+    found = type_kernel(operator, labels, rows=10**6)
+    sample = rows_of(operator.game, [labels])
+    close(
+        found.kernel.eigenvalues,
+        torch.linalg.eigvalsh(tangent_kernels(operator, sample.rows(sample.points.tau > 0))[0]).flip(0),
+    )
+    assert found.product is None
+    entry = type_entry(operator, labels, 40, 0)
+    assert (entry["reason"], entry["product"]) == (None, None)
+    assert entry["kernel"]["rows"] == 40
+    of_kernel, of_product = TangentKernel().rows([entry])
+    assert of_kernel["rank"].endswith("of 40")
+    assert {of_product[name] for name in ("condition", "rank", "effective_rank", "largest")} == {None}

@@ -43,19 +43,18 @@ def test_both_controllers_play_the_same_starts_and_the_solver_avoids_the_other()
     labels = [solved(*types[0], count=1), solved(*types[1]), solved(*types[2], count=1)]
     labels[2] = safe_starts(labels[2:], 0, 0.02)[0]
     rows = compare(Walkers(), straight, labels, types, interval=2, dt=0.1, disturbance=Disturbance(0.01, 0, 1))
-    assert [row.theta for row in rows] == [*types, None]
-    assert [row.policy.safe_starts for row in rows] == [row.solver.safe_starts for row in rows] == [1, 2, 0, 3]
-    assert [row.policy.collisions for row in rows] == [1, 2, 0, 3]
-    assert [row.solver.collisions for row in rows] == [0, 0, 0, 0]
-    assert [row.solves.solves for row in rows] == [5, 10, 0, 15]
-    assert [row.solves.failures for row in rows] == [0, 0, 0, 0]
-    assert (rows[2].solver.rate, rows[2].policy.interval, rows[2].solver.median_excess_cost) == (None, None, None)
-    assert rows[3].policy.rate == 1.0
-    assert rows[3].solver.interval == pytest.approx((0, 1 - 0.025 ** (1 / 3)))
-    for row in (rows[0], rows[1], rows[3]):
-        assert row.policy.median_excess_cost is not None
-        assert row.solver.median_excess_cost is not None
-        assert row.solver.median_excess_cost < row.policy.median_excess_cost
+    assert [row["theta"] for row in rows] == [*types, None]
+    learned, online, solves = ([row[name] for row in rows] for name in ("policy", "solver", "solves"))
+    assert [row["safe_starts"] for row in learned] == [row["safe_starts"] for row in online] == [1, 2, 0, 3]
+    assert [row["collisions"] for row in learned] == [1, 2, 0, 3]
+    assert [row["collisions"] for row in online] == [0, 0, 0, 0]
+    assert [row["solves"] for row in solves] == [5, 10, 0, 15]
+    assert [row["failures"] for row in solves] == [0, 0, 0, 0]
+    assert (online[2]["rate"], learned[2]["interval"], online[2]["median_excess_cost"]) == (None, None, None)
+    assert learned[3]["rate"] == 1.0
+    assert online[3]["interval"] == pytest.approx((0, 1 - 0.025 ** (1 / 3)))
+    for place in (0, 1, 3):
+        assert online[place]["median_excess_cost"] < learned[place]["median_excess_cost"]
 
 
 class Slow:

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import pytest
 import torch
 from rich.console import Console
 from torch import Tensor
 
-from hno.cli.tables import show_section
+from hno.cli.sections import show_section
+from hno.control import Policy
 from hno.control.rollout import Disturbance
 from hno.evaluation.closed_loop import collision_table
 from hno.evaluation.conditions import Condition, read_conditions
-from hno.evaluation.robustness import robustness_table
+from hno.evaluation.robustness import Robustness, robustness_row
+from hno.evaluation.sections import Evaluation
 from hno.games import make
 from hno.types import Extremal
 from tests.fakes import fake_labels
@@ -30,21 +33,29 @@ def straight(tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
     return torch.tensor([4.0, 0.0]).expand(len(x), 2, 2)
 
 
+class StraightWalkers(Policy):
+    """As `straight`, with its game."""
+
+    game = Walkers()
+
+    def act(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
+        return straight(tau, x, theta)
+
+
 SETS = [labelled([0.9, 0.05, 0.8]), labelled([0.9, 0.7], theta=2.0)]
 
 
 def test_the_undisturbed_line_repeats_the_collision_table() -> None:
-    (row,) = robustness_table(Walkers(), straight, [Condition("nothing")], lambda condition: SETS, 0.02, 0.02)
+    row = robustness_row(Walkers(), straight, Condition("nothing"), SETS, 0.02, 0.02)
     table = collision_table(Walkers(), straight, SETS, [])
-    assert (row.outcome.safe_starts, row.outcome.collisions, row.outcome.rate) == (5, 1, 0.2)
-    assert row.types == [
+    assert (row["safe_starts"], row["collisions"], row["rate"]) == (5, 1, 0.2)
+    assert row["types"] == [
         {"theta": entry.theta, "safe_starts": entry.outcome.safe_starts, "collisions": entry.outcome.collisions}
         for entry in table
     ]
-    assert row.outcome.interval is not None
-    assert row.outcome.interval[0] < 0.2 < row.outcome.interval[1]
+    assert row["interval"][0] < 0.2 < row["interval"][1]
     label_costs = torch.cat([-found.value[:, 0].sum(-1) for found in SETS])
-    assert row.outcome.median_label_cost == label_costs.median().item()
+    assert row["median_label_cost"] == label_costs.median().item()
 
 
 def test_every_condition_plays_the_labels_of_its_width_and_its_own_disturbance() -> None:
@@ -54,24 +65,22 @@ def test_every_condition_plays_the_labels_of_its_width_and_its_own_disturbance()
         asked.append(condition.widen)
         return [labelled([0.9] * (3 if condition.widen == 1 else 4))]
 
-    conditions = [
-        Condition("plain"),
-        Condition("wide", 2.0),
-        Condition("pushed", disturbance=Disturbance(drift=0.4, seed=1)),
-    ]
-    plain, wide, pushed = robustness_table(Walkers(), straight, conditions, labels_of, 0.02, 0.1)
+    conditions = {"plain": {}, "wide": {"widen": 2.0}, "pushed": {"drift": 0.4}}
+    options = {"conditions": conditions, "clearance": 0.02, "dt": 0.1, "seed": 1}
+    walkers: Any = StraightWalkers()
+    plain, wide, pushed = Robustness().compute(Evaluation("any", walkers, [], [(1.0, 1.0)], options, labels_of))
     assert asked == [1.0, 2.0, 1.0]
-    assert (plain.outcome.safe_starts, wide.outcome.safe_starts, pushed.outcome.safe_starts) == (3, 4, 3)
-    assert [row.content()["condition"] for row in (plain, wide, pushed)] == [{}, {"widen": 2.0}, {"drift": 0.4}]
-    assert plain.outcome.median_excess_cost != pushed.outcome.median_excess_cost
+    assert (plain["safe_starts"], wide["safe_starts"], pushed["safe_starts"]) == (3, 4, 3)
+    assert [row["condition"] for row in (plain, wide, pushed)] == [{}, {"widen": 2.0}, {"drift": 0.4}]
+    assert plain["median_excess_cost"] != pushed["median_excess_cost"]
 
 
 def test_without_safe_starts_there_are_no_rates() -> None:
     nothing = [labelled([0.9, 0.05], clearance=-1.0)]  # the second one collides, as its equilibrium does
-    (row,) = robustness_table(Walkers(), straight, [Condition("any")], lambda condition: nothing, 0.02, 0.1)
-    assert (row.outcome.safe_starts, row.outcome.collisions) == (0, 0)
-    found = row.outcome
-    assert (found.rate, found.interval, found.median_excess_cost, found.median_label_cost) == (None,) * 4
+    row = robustness_row(Walkers(), straight, Condition("any"), nothing, 0.02, 0.1)
+    assert (row["safe_starts"], row["collisions"]) == (0, 0)
+    for name in ("rate", "interval", "median_excess_cost", "median_label_cost"):
+        assert row[name] is None
 
 
 def test_entries_replace_those_of_the_table() -> None:
@@ -117,6 +126,6 @@ def test_impossible_conditions(content: object, message: str) -> None:
 def test_without_a_collision_no_type_is_the_worst(capsys: pytest.CaptureFixture[str]) -> None:
     for heights, worst in (([0.9, 0.8], "none"), ([0.9, 0.05], "1 of 2 at (1, 1)")):
         labels = [labelled(heights)]
-        rows = robustness_table(Walkers(), straight, [Condition("all")], lambda _, labels=labels: labels, 0.02, 0.1)
-        show_section("robustness", [row.content() for row in rows], {}, Console(width=140))
+        row = robustness_row(Walkers(), straight, Condition("all"), labels, 0.02, 0.1)
+        show_section("robustness", [row], {}, Console(width=140))
         assert worst in capsys.readouterr().out

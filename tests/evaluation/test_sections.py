@@ -10,9 +10,8 @@ import pytest
 from rich.console import Console
 
 from hno.cli.results import Results
-from hno.cli.sections import chosen_sections, run_sections
-from hno.cli.tables import show_section
-from hno.evaluation.conditions import Condition
+from hno.cli.sections import chosen_sections, run_sections, show_section
+from hno.control import Feedback
 from hno.evaluation.sections import Column, Evaluation, ModelSection, Section, sections
 from hno.games import make
 from hno.operators import make_operator
@@ -46,10 +45,7 @@ def horizon() -> Iterator[type[Section]]:
 def test_a_section_from_outside_is_computed_and_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     operator = make_operator(make("narrow_road"), small_architecture())
     types = [(1.0, 1.0), (2.0, 2.0)]
-    evaluation = Evaluation(
-        "any", operator, lambda tau, x, theta: x, types, types, Condition(), 0.02, 0.1, {"horizon": True},
-        lambda condition: [],
-    )  # fmt: skip
+    evaluation = Evaluation("any", Feedback(operator), types, types, {"horizon": True}, lambda condition: [])
     results = Results(tmp_path / "results.json", {})
     assert list(run_sections(evaluation, results)) == [("horizon", {"types": 2, "seconds": 3.0})]
     assert results.content["seconds"]["horizon"] >= 0
