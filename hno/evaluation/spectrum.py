@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -84,3 +84,41 @@ def condition_ratio(over: Summary, under: Summary) -> Ratio:
         found["condition"] if known else 1 / found["cutoff"] for found, known in zip((over, under), whole, strict=True)
     )
     return Ratio(large / small, {(True, True): "=", (False, True): ">", (True, False): "<"}[whole])
+
+
+def condition_ratios(results: Mapping[str, Sequence[Mapping[str, Any]]], over: str = "tanh") -> list[dict[str, Any]]:
+    """Ratios of condition numbers per player type (the paper's table of activations: tanh / sin and tanh / relu).
+
+    Args:
+        results: sections "ntk" of results.json, by activation or any other name.
+        over: the name whose condition numbers are divided by those of the others.
+
+    Returns:
+        One entry for every type that all sections have: "theta", and for "kernel" and for "product" a `Ratio` by name.
+
+    Raises:
+        ValueError: no section of that name or no other one, no common type, or kernels of different points.
+    """
+    if over not in results or len(results) < 2:
+        raise ValueError(f"Ratios need a section {over!r} and at least one other; got {', '.join(results) or 'none'}.")
+    sections = {
+        name: {tuple(entry["theta"]): entry for entry in section if entry["kernel"] is not None}
+        for name, section in results.items()
+    }
+    common = [theta for theta in sections[over] if all(theta in section for section in sections.values())]
+    if not common:
+        raise ValueError(f"The sections {', '.join(results)} have no player type in common: evaluate the same types.")
+    return [_ratios(theta, {name: section[theta] for name, section in sections.items()}, over) for theta in common]
+
+
+def _ratios(theta: tuple[float, ...], entries: Mapping[str, Mapping[str, Any]], over: str) -> dict[str, Any]:
+    points = {name: entry["points"] for name, entry in entries.items()}
+    if len(set(points.values())) > 1:
+        raise ValueError(
+            f"Kernels of different numbers of points do not compare; at theta = {theta} these are {points}."
+        )
+    numerator, others = entries[over], [name for name in entries if name != over]
+    return {"theta": list(theta)} | {
+        kind: {name: condition_ratio(numerator[kind], entries[name][kind]) for name in others}
+        for kind in ("kernel", "product")
+    }
