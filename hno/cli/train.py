@@ -39,8 +39,8 @@ from hno.cli.schema import TrainSettings
 from hno.cli.sections import run_sections
 from hno.cli.starts import cache_folder, label_solver
 from hno.cli.summary import report, show
-from hno.data.certificates import summary
-from hno.data.datamodule import GameData, safe_sets
+from hno.data.certificates import safe_sets, summary
+from hno.data.datamodule import GameData
 from hno.data.labels import Request, safe_labels_for
 from hno.evaluation.sections import Evaluation
 from hno.games.grid import parse_types
@@ -160,7 +160,7 @@ def validation_starts(settings: TrainSettings, data: GameData, results: Results)
     """
     choice, clearance = settings.validation, settings.evaluation.clearance
     if choice.types is None:
-        return data.safe_held_out(clearance), None
+        return safe_sets(data.held_out(), clearance), None
     types = parse_types(data.game, choice.types, key="validation.types")
     cache, workers = cache_folder(settings.data.cache), settings.data.workers
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from torch import Tensor
 
-from hno.types import Extremal, Status
+from hno.types import Extremal, Status, part
 
 LOCAL_GAP = 1e-4
 """Best-response gap from the equilibrium itself above which a label is doubtful, relative."""
@@ -51,3 +52,9 @@ def summary(found: Extremal) -> dict[str, Any]:
 
 def _largest(values: Tensor) -> float | None:
     return float(values.max()) if len(values) and bool(values.isfinite().all()) else None
+
+
+def safe_sets(labels: Sequence[Extremal], clearance: float = CLEARANCE) -> list[Extremal]:
+    """Labels of starts whose equilibrium keeps a clearance, without sets that have none."""
+    selected = [part(found, safe(found, clearance)) for found in labels]
+    return [found for found in selected if len(found.status)]

@@ -5,32 +5,24 @@ from __future__ import annotations
 import copy
 import hashlib
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from pathlib import Path
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any, NamedTuple
 
 import lightning as L
 import torch
 from torch import Tensor
-from torch.utils.data import DataLoader, Dataset, IterableDataset
+from torch.utils.data import DataLoader, IterableDataset
 
-from hno.data.certificates import CLEARANCE, safe
-from hno.data.curriculum import Curriculum
 from hno.data.exchange import read_own
 from hno.data.labels import Report, Request, default_cache, labels_for
+from hno.data.plans import BATCH_SIZES, Collocation, LabelPlan
 from hno.data.rows import rows_of
-from hno.data.sources import Known, Pool, Sampler, make_sampler, sample_points
+from hno.data.sources import Known, Pool, sample_points
 from hno.games import Game
-from hno.pontryagin.solve import Solver
 from hno.types import Batch, Extremal, Sample, Trajectory, Types, part
 
 BOX_TYPES = 32
 """Types that one batch of collocation points draws from the type box: the branch runs once for each."""
-MIXED: Mapping[str, float] = {"box": 0.3, "band": 0.2, "labels": 0.5}
-"""Shares of the default sampler."""
-BATCH_SIZES: Mapping[str, int | None] = {"bvp": 2048, "interior": 512, "terminal": 128}
-"""Rows per step of each stream by default."""
 
 
 class Visit(NamedTuple):
@@ -42,37 +34,6 @@ class Visit(NamedTuple):
     """Times to go, (L,)."""
     x: Tensor
     """States, (L, P, n)."""
-
-
-@dataclass(frozen=True)
-class LabelPlan:
-    """Which labels are solved, read or brought along."""
-
-    types: Sequence[Sequence[float]] = ()
-    """Player types with labels; the corners of the type box and points between them by default."""
-    trajectories: int = 160
-    """Labelled trajectories per type."""
-    validation: int = 16
-    """Trajectories per type that are held out."""
-    files: Sequence[Path] = ()
-    """Label files of your own, see `hno.data.exchange`; their types count as labelled."""
-    cache: Path | None = None
-    """Folder of label files; $HNO_CACHE or the user's cache folder by default."""
-    solver: Solver = Solver()
-    workers: int | None = None
-    """Label processes; the number of cores by default."""
-
-
-@dataclass(frozen=True)
-class Collocation:
-    """Which collocation points are drawn, and when."""
-
-    sampler: Sampler = field(default_factory=lambda: make_sampler(MIXED))
-    """Where they come from."""
-    curriculum: Curriculum = field(default_factory=lambda: Curriculum(0, 0))
-    """When collocation begins, how the window widens, and when it ends."""
-    types: str = "labelled"
-    """"labelled" draws their player types among those of the labels, "box" from the type box."""
 
 
 class GameData(L.LightningDataModule):
@@ -178,10 +139,6 @@ class GameData(L.LightningDataModule):
         """Labels that are not trained on, one set per labelled type; none without labels."""
         return [part(found, slice(-self.labels.validation, None)) for found in self.extremals]
 
-    def safe_held_out(self, clearance: float = CLEARANCE) -> list[Extremal]:
-        """Held-out labels of starts whose equilibrium keeps a clearance, one set per type that has any."""
-        return safe_sets(self.held_out(), clearance)
-
     def scales(self) -> tuple[Tensor, Tensor]:
         """Typical sizes of values, scalar, and of costates, (P, P, n).
 
@@ -270,24 +227,7 @@ class GameData(L.LightningDataModule):
 
     def val_dataloader(self) -> DataLoader[Sample] | list[Any]:
         """Held-out labelled rows, in one batch; nothing without labels."""
-        return [] if self.val_rows is None else DataLoader(_Whole(self.val_rows), batch_size=None)
-
-
-def safe_sets(labels: Sequence[Extremal], clearance: float = CLEARANCE) -> list[Extremal]:
-    """Labels of starts whose equilibrium keeps a clearance, without sets that have none."""
-    selected = [part(found, safe(found, clearance)) for found in labels]
-    return [found for found in selected if len(found.status)]
-
-
-class _Whole(Dataset[Sample]):
-    def __init__(self, sample: Sample) -> None:
-        self.sample = sample
-
-    def __len__(self) -> int:
-        return 1
-
-    def __getitem__(self, index: int) -> Sample:
-        return self.sample
+        return [] if self.val_rows is None else DataLoader([self.val_rows], batch_size=None)  # type: ignore[arg-type]  # a list is a data set
 
 
 class _Steps(IterableDataset[Batch]):

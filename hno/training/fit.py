@@ -15,6 +15,7 @@ from lightning.pytorch.callbacks import ModelCheckpoint, ProgressBar
 from lightning.pytorch.loggers import Logger
 
 from hno.data import GameData
+from hno.data.certificates import safe_sets
 from hno.losses import Objective, Scales
 from hno.operators import ValueOperator
 from hno.training.divergence import StopOnDivergence
@@ -110,7 +111,7 @@ def fit(
     if objective.scaled:
         operator.set_scales(Scales(*data.scales()))
     watch = ClosedLoopValidation(folder, settings.validate_every, dt=settings.dt, stop=settings.stop_when_safe)
-    watch.begin(data.safe_held_out() if validation is None else validation, later)
+    watch.begin(safe_sets(data.held_out()) if validation is None else validation, later)
     trainer = make_trainer(settings, folder, loggers, [watch, *callbacks])
     began = time.perf_counter()
     trainer.fit(module, datamodule=data, ckpt_path=resume, weights_only=True)
