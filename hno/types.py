@@ -101,8 +101,9 @@ class Status(IntEnum):
 
 _ADVICE = {
     Status.CONVERGED: "the residual is below the tolerance: use it",
-    Status.STALLED: "the residual stopped falling, mostly where controls saturate or a constraint has kinks: smooth "
-    "the constraint, or try hno.pontryagin.Solver(extra_nodes=120)",
+    Status.STALLED: "the residual stopped falling, mostly where controls saturate or a constraint has kinks: give "
+    "every pair of players a constraint of its own, smooth it, or try hno.pontryagin.Solver(extra_nodes=120); players "
+    "with opposed interests, as in pursuit, are beyond the search",
     Status.MAX_STEPS: "the residual was still falling: raise Solver(newton=Newton(steps=...))",
     Status.NOT_FINITE: "states or costates grew beyond bounds: check that dynamics and costs are finite around the PDE "
     "box, with hno.games.testing.check_game",

@@ -49,7 +49,7 @@ def name(page: Path) -> str:
 
 
 class Shell:
-    """A folder in which a reader works, with `hno` on the path and with labels of its own.
+    """A folder in which a reader works, with `hno` on the path.
 
     Args:
         folder: empty.
@@ -65,7 +65,6 @@ class Shell:
         self.environment = os.environ | {
             "PATH": f"{bin_folder}:{Path(sys.executable).parent}:{os.environ['PATH']}",
             "PYTHONPATH": f"{self.site}:{ROOT}",
-            "HNO_CACHE": str(folder / "cache"),
             "OMP_NUM_THREADS": "1",
             "WANDB_MODE": "offline",
         }
@@ -117,7 +116,15 @@ def test_links_of_pages_outside_the_site_exist(page: Path) -> None:
         assert (ROOT / target).exists(), target
 
 
-OWN = re.compile(r"=(crossing|values|parametric|adagrad)\b|\.(smooth|starts)\b|mine\.safetensors")
+def test_pages_that_the_sources_name_exist() -> None:
+    sources = [path for folder in ("hno", "conf", "benchmarks", "examples") for path in (ROOT / folder).rglob("*")]
+    for path in sources:
+        if path.suffix in (".py", ".yaml", ".toml"):
+            for page in re.findall(r"docs/[\w/-]+\.\w+", path.read_text(encoding="utf-8")):
+                assert (ROOT / page).exists(), f"{path} names {page}"
+
+
+OWN = re.compile(r"=(crossing|values|growing|parametric|lion)\b|\.(growing_residual|coasting)\b|mine\.safetensors")
 """What exists only after a reader has made it; other tests make it."""
 
 
@@ -173,7 +180,9 @@ def test_the_tutorial_can_be_followed(shell: Shell) -> None:
 def test_the_tutorial_ends_with_a_safe_controller(shell: Shell) -> None:
     follow(shell, everything=True)
     results = json.loads((shell.at / "outputs/crossing/results.json").read_text())
-    assert sum(row["collisions"] for row in results["table"]) == 0
+    collisions, starts = (sum(row[entry] for row in results["table"]) for entry in ("collisions", "safe_starts"))
+    assert starts > 1000
+    assert collisions < 0.01 * starts
 
 
 def test_the_notebook_prints_what_it_shows(shell: Shell) -> None:
@@ -192,23 +201,6 @@ def test_the_notebook_prints_what_it_shows(shell: Shell) -> None:
     assert ended.returncode == 0, ended.stderr
     printed = [text.strip() for text in ended.stdout.split("\0")[:-1]]
     assert printed == ["".join("".join(o["text"]) for o in cell["outputs"]).strip() for cell in cells]
-
-
-def test_extensions_on_the_how_to_pages_train_together(shell: Shell) -> None:
-    for page in ("loss", "network", "sampler"):
-        for block in blocks(ROOT / f"docs/howto/{page}.md"):
-            if block.title is not None and block.title.endswith(".py"):
-                (shell.folder / block.title).write_text(block.text)
-    (shell.folder / "train_all.py").write_text(
-        "import parametric, smooth, starts\nfrom hno.cli.main import main\nraise SystemExit(main())\n"
-    )
-    shell.run(
-        "python train_all.py train experiment=smoke operator=hno loss.terms.smooth.spread=0.02 loss.weights.smooth=0.1 "
-        'network=parametric network.width=16 "sampler.starts={share: 0.5, widen: 2.0}" --to run'
-    )
-    results = json.loads((shell.folder / "run/results.json").read_text())
-    assert results["status"] == "finished"
-    assert results["metrics"]["loss/smooth"] > 0
 
 
 def test_the_game_with_a_clock_keeps_the_contract(shell: Shell) -> None:

@@ -30,12 +30,12 @@ def publish(loggers: Sequence[Logger], results: Mapping[str, Any], folder: Path,
     pictures = draw(results, folder, {type(logger) for logger in loggers})
     for logger in loggers:
         try:
-            if isinstance(logger, WandbLogger):
-                _send_to_wandb(logger, results, pictures, step)
-            elif isinstance(logger, TensorBoardLogger):
+            if isinstance(logger, TensorBoardLogger):
                 _send_to_tensorboard(logger, results, pictures, step)
             else:
                 logger.log_metrics(numbers(results), step)
+            if isinstance(logger, WandbLogger):
+                _send_to_wandb(logger, results["table"], pictures, step)
             logger.finalize("success")  # the end of the training finalized it before these numbers came
         except Exception as error:
             log.warning("%s did not take the results: %s", type(logger).__name__, error)
@@ -69,30 +69,28 @@ def draw(results: Mapping[str, Any], folder: Path, kinds: Collection[type[Logger
         Names and files of the pictures.
     """
     title = " / ".join(str(results.get(name, "n/a")) for name in ("game", "operator", "activation"))
-    made = {"rollout": folder / "rollout.png"}
+    made = {name: folder / f"{name}.png" for name in ("rollout", "worst_episode", "collision_map")}
     with _harmless():
         from hno.report import pictures
         from hno.report.episode import episode
 
         worst = worst_episode(results, folder) if WandbLogger in kinds else None
         if worst is not None:
-            made["worst_episode"] = folder / "worst_episode.png"
             smallest = f"{number(worst['clearance'])} {results.get('constraint_unit', 'm')}".strip()
             heading = f"{title}\nsmallest clearance, {smallest} at ({name_of(worst['theta'])})"
             pictures.rollout_picture(episode(worst), made["worst_episode"], heading)
         if not {WandbLogger, TensorBoardLogger}.isdisjoint(kinds):
-            made["collision_map"] = folder / "collision_map.png"
             pictures.collision_map(results["table"], made["collision_map"], title)
     return {name: path for name, path in made.items() if path.exists()}
 
 
 def draw_typical(episodes: Sequence[Mapping[str, Any]], path: Path, title: str) -> None:
     """Draw the first typical episode of episodes.json, if there is one; say what cannot be drawn."""
-    typical = next((entry for entry in episodes if entry["kind"] == "typical"), None)
     with _harmless():
         from hno.report.episode import episode
         from hno.report.pictures import rollout_picture
 
+        typical = next((entry for entry in episodes if entry["kind"] == "typical"), None)
         if typical is None:
             raise ValueError("no start has a safe equilibrium")
         rollout_picture(episode(typical), path, title)
@@ -103,9 +101,7 @@ def _harmless() -> Iterator[None]:
     """A picture that cannot be drawn costs a line in the log, not the run."""
     try:
         yield
-    except ModuleNotFoundError as error:
-        log.info("No picture: it needs the package %s.", error.name)
-    except (OSError, ValueError) as error:
+    except (ModuleNotFoundError, OSError, ValueError) as error:
         log.info("No picture: %s", error)
     except Exception as error:
         log.warning("A picture could not be drawn: %s: %s", type(error).__name__, error)
@@ -116,22 +112,17 @@ def worst_episode(results: Mapping[str, Any], folder: Path) -> dict[str, Any] | 
     if not results.get("episodes"):
         return None
     episodes = json.loads((folder / results["episodes"]).read_text())["episodes"]
-    return min(episodes, key=_clearance, default=None)
+    return min(episodes, key=lambda one: -math.inf if one["clearance"] is None else one["clearance"], default=None)
 
 
-def _clearance(episode: Mapping[str, Any]) -> float:
-    return -math.inf if episode["clearance"] is None else float(episode["clearance"])
-
-
-def _send_to_wandb(logger: WandbLogger, results: Mapping[str, Any], pictures: Mapping[str, Path], step: int) -> None:
-    logger.log_metrics(numbers(results), step)
-    whole = pooled(results["table"])
+def _send_to_wandb(logger: WandbLogger, table: Sequence[Any], pictures: Mapping[str, Path], step: int) -> None:
+    whole = pooled(table)
     nobody = "n/a" if whole.rate is None else "none"
     logger.experiment.summary["test/worst_theta"] = name_of(whole.worst_theta) if whole.worst_theta else nobody
     for name, path in pictures.items():
         logger.log_image(name, [str(path)], step)
-    columns = list(results["table"][0]) if results["table"] else []
-    logger.log_table("types", columns, [[str(row[name]) for name in columns] for row in results["table"]], step=step)
+    columns = list(table[0]) if table else []
+    logger.log_table("types", columns, [[str(row[name]) for name in columns] for row in table], step=step)
 
 
 def _send_to_tensorboard(

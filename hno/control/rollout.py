@@ -93,15 +93,17 @@ def _played(
         u = answers[max(0, k - disturbance.delay)]
         if noise is not None:
             u = game.control_box.clamp(u + noise[:, k])
+        inner = []
         for _ in range(substeps):
             after = runge_kutta(game, x, u, dt / substeps, push=None if push is None else push[:, k])
-            inner = _between(x, after, points)
-            types, held = theta.unsqueeze(1).expand(inner.shape[:-1]), u.unsqueeze(1).expand(-1, points + 1, -1, -1)
-            clearance = torch.minimum(clearance, -game.constraint(inner, types).amax((1, 2, 3)))
-            distance = torch.minimum(distance, separation(game.positions(inner)).amin((-2, -1)))
-            cost = torch.trapezoid(game.running_cost(inner, held, types), dx=1 / points, dim=1)
-            value = value - dt / substeps * cost
+            inner.append(_between(x, after, points))
             x = after
+        inside = torch.stack(inner, 1)
+        types = theta[:, None, None].expand(inside.shape[:-1])
+        clearance = torch.minimum(clearance, -game.constraint(inside, types).flatten(1).amax(1))
+        distance = torch.minimum(distance, separation(game.positions(inside)).flatten(1).amin(1))
+        rate = torch.trapezoid(game.uncontrolled_cost(inside, types), dx=1 / points, dim=2)
+        value = value - dt * (game.effort(u) + rate.mean(1))
         path.append(x)
         controls.append(u)
         player.observe(torch.where(x.isfinite().all(-1).all(-1)[:, None, None], x, x0), u, dt)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from scipy.stats import binomtest
+from scipy.special import betaincinv
 from torch import Tensor
 
 from hno.games import Box
@@ -39,5 +39,7 @@ def clopper_pearson(successes: int, trials: int, confidence: float = 0.95) -> tu
     """Exact interval of a binomial rate; None without trials."""
     if trials == 0:
         return None
-    interval = binomtest(successes, trials).proportion_ci(confidence, method="exact")
-    return float(interval.low), float(interval.high)
+    tail, failures = (1 - confidence) / 2, trials - successes
+    low = betaincinv(successes, failures + 1, tail) if successes else 0.0
+    high = betaincinv(successes + 1, failures, 1 - tail) if failures else 1.0
+    return float(low), float(high)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -75,12 +75,52 @@ def summary(found: Spectrum) -> dict[str, Any]:
     return {"rows": len(found.eigenvalues), **plain, "curve": curve}
 
 
-def condition_ratio(over: Summary, under: Summary) -> Ratio:
+def condition_ratio(over: Summary | None, under: Summary | None) -> Ratio:
     """Condition number of one matrix over that of another; a bound where one of them is cut off."""
-    whole = tuple(found["rank"] == found["rows"] for found in (over, under))
-    if 0 in (over["rank"], under["rank"]) or not any(whole):
+    if over is None or under is None or not (over["rank"] and under["rank"]):
+        return Ratio(None, "n/a")
+    whole = over["rank"] == over["rows"], under["rank"] == under["rows"]
+    bound = {(True, True): "=", (False, True): ">", (True, False): "<"}.get(whole)
+    if bound is None:
         return Ratio(None, "n/a")
     large, small = (
-        found["condition"] if known else 1 / found["cutoff"] for found, known in zip((over, under), whole, strict=True)
+        one["condition"] if known else 1 / one["cutoff"] for one, known in zip((over, under), whole, strict=True)
     )
-    return Ratio(large / small, {(True, True): "=", (False, True): ">", (True, False): "<"}[whole])
+    return Ratio(large / small, bound)
+
+
+def condition_ratios(results: Mapping[str, Sequence[Mapping[str, Any]]], over: str = "tanh") -> list[dict[str, Any]]:
+    """Ratios of condition numbers per player type (the paper's table of activations: tanh / sin and tanh / relu).
+
+    Args:
+        results: sections "ntk" of results.json, by activation or any other name.
+        over: the name whose condition numbers are divided by those of the others.
+
+    Returns:
+        One entry for every type that all sections have: "theta", and for "kernel" and for "product" a `Ratio` by name.
+
+    Raises:
+        ValueError: no section of that name or no other one, no common type, or kernels of different points.
+    """
+    if over not in results or len(results) < 2:
+        raise ValueError(f"Ratios need a section {over!r} and at least one other; got {', '.join(results) or 'none'}.")
+    sections = {
+        name: {tuple(entry["theta"]): entry for entry in section if entry["kernel"] is not None}
+        for name, section in results.items()
+    }
+    common = [theta for theta in sections[over] if all(theta in section for section in sections.values())]
+    if not common:
+        raise ValueError(f"The sections {', '.join(results)} have no player type in common: evaluate the same types.")
+    return [_ratios(theta, {name: section[theta] for name, section in sections.items()}, over) for theta in common]
+
+
+def _ratios(theta: tuple[float, ...], entries: Mapping[str, Mapping[str, Any]], over: str) -> dict[str, Any]:
+    points = {name: entry["points"] for name, entry in entries.items()}
+    if len(set(points.values())) > 1:
+        raise ValueError(
+            f"Kernels of different numbers of points do not compare; at theta = {theta} these are {points}."
+        )
+    return {"theta": list(theta)} | {
+        kind: {name: condition_ratio(entries[over][kind], one[kind]) for name, one in entries.items() if name != over}
+        for kind in ("kernel", "product")
+    }

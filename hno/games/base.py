@@ -32,9 +32,8 @@ class Game(FinalMethods, nn.Module, abc.ABC):
     The dynamics are decoupled: `dynamics(x, u)[..., i, :]` depends on the state and control of player i alone. What
     couples the players is the running cost of states (paper, eq. 5), mostly the penalty of the constraints.
 
-    A subclass sets the attributes below and overrides the abstract methods, and others where their docstrings say so;
-    the methods in `INSTEAD` are shared and final. Methods accept any leading batch shape B, the same for all their
-    arguments, and both float32 and float64. There are P players with n states, m controls and C constraints each.
+    A subclass sets the attributes below and overrides abstract methods and defaults; those in `INSTEAD` are final.
+    Methods accept any leading batch shape B, the same for all arguments, and both float32 and float64.
     """
 
     INSTEAD: ClassVar[Mapping[str, str]] = {
@@ -118,7 +117,7 @@ class Game(FinalMethods, nn.Module, abc.ABC):
         """Where the players are in one common frame, m, (B, P, n) -> (B, P, 2 or 3); distances and pictures use it."""
 
     def state_cost(self, x: Tensor, theta: Tensor) -> Tensor:
-        """Further running cost of states, such as tracking, 1/s, (B, P, n), (B, P) -> (B, P); none by default."""
+        """Further running cost of states, such as tracking, 1/s, (B, P, n), (B, P) -> (B, P); 0 by default."""
         return torch.zeros_like(x[..., 0])
 
     def soft_constraint(self, constraint: Tensor) -> Tensor:
@@ -126,10 +125,7 @@ class Game(FinalMethods, nn.Module, abc.ABC):
         return self.penalty_height * torch.sigmoid(self.penalty_slope * constraint)
 
     def penalty(self, x: Tensor, theta: Tensor) -> Tensor:
-        """Sum of every player's soft constraints, 1/s, (B, P, n), (B, P) -> (B, P).
-
-        Override it where the penalty is no function of the constraints.
-        """
+        """Sum of soft constraints by default, 1/s, (B, P, n), (B, P) -> (B, P)."""
         return self.soft_constraint(self.constraint(x, theta)).sum(-1)
 
     def sensors(self, theta: Tensor) -> Tensor:

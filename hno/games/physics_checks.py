@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import itertools
+import warnings
 
 import torch
 from torch import Tensor
@@ -28,7 +29,7 @@ def check_physics(game: Game) -> None:
         ContractError: the first promise that the game breaks.
     """
     checks = (_check_fingerprint, _check_decoupled, _check_optimality, _check_roles)
-    for check in (*checks, _check_periodic, _check_penalty, _check_starts, _check_signs):
+    for check in (*checks, _check_periodic, _check_penalty, _check_starts, _check_signs, _warn_of_opposition):
         check(game)
 
 
@@ -146,6 +147,28 @@ def _check_signs(game: Game) -> None:
     grows, falls = bool((bend("terminal_value") > 1e-3).all()), bool((bend("state_cost") < -1e-3).all())
     require(not grows, "a terminal_value that is a reward", "one that grows without bound for all players", remedy)
     require(not falls, "a state_cost that is a cost", "one that falls without bound for all players", remedy)
+
+
+def _warn_of_opposition(game: Game) -> None:
+    """Warn of games such as pursuit, in which what one player does for itself harms another directly.
+
+    The search descends on the joint cost, in which opposed rewards cancel. Starting from best replies to each other
+    solves more of these games, but not all, and makes every start that fails take seconds.
+    """
+    x, theta, *_ = (points(game, (64,), torch.float64)[k] for k in (0, 3))
+    x = x.requires_grad_()
+    reward = game.terminal_value(x) - game.horizon * game.state_cost(x, theta)
+    totals = [part.sum() + 0 * x.sum() for part in reward.unbind(-1)]
+    slope = torch.stack([torch.autograd.grad(total, x, retain_graph=True)[0] for total in totals])
+    own = slope.diagonal(dim1=0, dim2=2).movedim(-1, 1)
+    along, size = (slope * own).sum((1, 3)), (slope.norm(dim=-1) * own.norm(dim=-1)).sum(1)
+    opposed = (along < -0.5 * size) & (size > 1e-9)
+    if bool(opposed.any()):
+        warnings.warn(
+            f"Players {opposed.nonzero()[0].tolist()} have opposed interests. The solver's search is made for players "
+            "who share what couples them: where rows stall or have a large global_gap, they are no equilibria.",
+            stacklevel=3,
+        )
 
 
 def _check_fingerprint(game: Game) -> None:

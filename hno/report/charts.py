@@ -11,101 +11,71 @@ from hno.report import vega
 from hno.report.episode_charts import encounter, separation
 from hno.report.vega import Layers, colors
 
-RATES = (0.001, 1.0)
-"""Ends of the logarithmic colour scale of collision rates, the same everywhere; rates below have the first colour."""
-CELL = 34
-"""Width of a heat map's cell, px."""
-
-
-def _percent(value: str) -> str:
-    return f"format(100 * {value}, '.2f') + ' %'"
-
-
+LEAST = 0.001
+"""Lower end of the logarithmic colour scale of collision rates, everywhere; rates below have its first colour."""
 LABEL = (
     "!datum.safe_starts ? 'n/a' : datum.shown === 0 ? '0' : datum.shown < 0.0005 ? '<0.1' : "
     "format(100 * datum.shown, datum.shown < 0.0995 ? '.1f' : '.0f')"
 )
 """A rate in %, short enough for a cell; a collision is never rounded away."""
-TIP = (
-    "'types (' + join(datum.theta, ', ') + '), ' + (datum.seen ? 'seen in training' : 'without training labels')"
-    "+ (datum.extrapolated ? '\\noutside the range that the game is made for: extrapolated' : '')"
-    "+ (datum.safe_starts ? '\\n' + datum.collisions + ' of ' + datum.safe_starts + ' safe starts collide: ' + "
-    f"{_percent('datum.rate')} + '\\n95 % interval ' + {_percent('datum.interval[0]')} + ' to ' + "
-    f"{_percent('datum.interval[1]')} : '\\nno safe start: rate n/a')"
-    "+ (datum.relative_excess === null ? '' : '\\nmedian excess cost ' + format(100 * datum.relative_excess, '+.1f') "
-    "+ ' %')"
-)
 
 
-def heat_map(data: Any, cell: int = CELL, legend: alt.Legend | None = None, counts: bool = False) -> Layers:
-    """Collision rates over the types of two players.
-
-    Args:
-        data: rows of `recipes.TypeCounts`.
-        cell: width of a cell, px.
-        legend: of the colours; none by default.
-        counts: whether cells tell their numbers of starts too.
+def heat_map(data: Any, legend: alt.Legend | None = None) -> Layers:
+    """Collision rates over the types of two players, in % in the cells, from rows of `recipes.by_type`.
 
     Its signals: "bound" is "rate", or "high" for the upper end of the rate's interval; "small" says whether cells have
     no room for a number.
     """
+    axis = alt.Axis(labelAngle=0, ticks=False, domain=False, offset=2)
     base = (
         alt.Chart(data)
         .transform_calculate(theta_1="datum.theta[0]", theta_2="datum.theta[1]")
         .transform_calculate(shown="datum.safe_starts && bound === 'high' ? datum.interval[1] : datum.rate")
-        .transform_calculate(label=LABEL, tip=TIP, of="'of ' + datum.safe_starts")
+        .transform_calculate(label=LABEL)
         .encode(
-            x=alt.X("theta_1:O", title="θ₁", axis=alt.Axis(labelAngle=0, ticks=False, domain=False, offset=2)),
-            y=alt.Y("theta_2:O", sort="descending", title="θ₂", axis=alt.Axis(ticks=False, domain=False, offset=2)),
+            x=alt.X("theta_1:O", title="θ₁", axis=axis),
+            y=alt.Y("theta_2:O", title="θ₂", axis=axis, sort="descending"),
             tooltip="tip:N",
         )
     )
-    scale = alt.Scale(type="log", domain=list(RATES), clamp=True, range="heatmap", interpolate="rgb")
-    cells = base.mark_rect(cornerRadius=3, stroke=alt.expr("muted"), strokeWidth=alt.expr("0"))
-    some = cells.transform_filter("datum.shown > 0").encode(color=alt.Color("shown:Q", scale=scale, legend=legend))
-    none = cells.mark_rect(cornerRadius=3, fill=alt.expr("zero")).transform_filter("datum.shown === 0")
-    nothing = base.mark_rect(cornerRadius=3, fill="transparent", stroke=alt.expr("muted"), strokeDash=[2, 3])
-    seen = base.mark_rect(cornerRadius=3, fill=None, stroke=alt.expr("ink"), strokeWidth=2)
+    scale = alt.Scale(type="log", domain=[LEAST, 1], clamp=True, range="heatmap", interpolate="rgb")
+    cell = base.mark_rect(cornerRadius=3, fill=alt.expr("zero"))
+    some = cell.mark_rect(cornerRadius=3).encode(color=alt.Color("shown:Q", scale=scale, legend=legend))
+    empty = cell.mark_rect(cornerRadius=3, fill="transparent", stroke=alt.expr("muted"), strokeDash=[2, 3])
+    frame = cell.mark_rect(cornerRadius=3, fill=None, stroke=alt.expr("ink"), strokeWidth=2)
     contrast = "datum.shown > 0 ? (luminance(scale('color', datum.shown)) < 0.2 ? '#fff' : '#111') : muted"
-    size = alt.expr("small ? 8 : 11")
-    text = base.mark_text(fill=alt.expr(contrast), fontSize=size, dy=-6 if counts else 0)
-    label = text.transform_filter("!small || !(datum.shown > 0)").encode(text="label:N")
-    starts = [text.mark_text(fill=alt.expr(contrast), fontSize=9, dy=8).encode(text="of:N")] if counts else []
-    layers = (none, some, nothing.transform_filter("datum.shown === null"), seen.transform_filter("datum.seen"), label)
+    label = base.mark_text(fill=alt.expr(contrast), fontSize=alt.expr("small ? 8 : 11")).encode(text="label:N")
     return (
-        alt.layer(*layers, *starts)
-        .properties(width=alt.Step(cell), height=alt.Step(cell))
+        alt.layer(
+            cell.transform_filter("datum.shown === 0"),
+            some.transform_filter("datum.shown > 0"),
+            empty.transform_filter("datum.shown === null"),
+            frame.transform_filter("datum.seen"),
+            label.transform_filter("!small || !(datum.shown > 0)"),
+        )
+        .properties(width=alt.Step(34), height=alt.Step(34))
         .add_params(*colors(), alt.param(name="bound", value="rate"), alt.param(name="small", value=False))
     )
 
 
 def comparison(data: Any) -> Layers:
-    """Collision rates of recipes with their intervals, and of their seeds.
-
-    Args:
-        data: rows with recipe, rate, low, high, seed (null for the pooled rate), count (a text beside the pooled rate),
-            tip; in the order to be shown.
-    """
-    base = alt.Chart(data).encode(
-        y=alt.Y("recipe:N", sort=None, title=None, axis=alt.Axis(labelLimit=260, ticks=False, domain=False))
-    )
-    pooled = base.transform_filter("datum.seed === null")
-    seeds = base.transform_filter("datum.seed !== null")
-    band = pooled.mark_rule(strokeWidth=3, strokeCap="round", color=alt.expr("muted"), opacity=0.55)
-    scale = alt.Scale(type="symlog", constant=RATES[0] / 4, domain=[0, 1], nice=False)
+    """Collision rates of recipes with their intervals, and of their seeds, from rows of `page_data.comparison`."""
+    name = alt.Y("recipe:N", sort=None, title=None, axis=alt.Axis(labelLimit=260, ticks=False, domain=False))
+    scale = alt.Scale(type="symlog", constant=LEAST / 4, domain=[0, 1], nice=False)
     axis = alt.Axis(values=[0, 0.001, 0.01, 0.1, 1], labelExpr="100 * datum.value + ' %'")
     rate = alt.X("rate:Q", scale=scale, axis=axis, title="collisions of safe starts")
+    base = alt.Chart(data).encode(y=name, x=rate, tooltip="tip:N")
+    pooled = base.transform_filter("datum.seed === null")
+    band = pooled.mark_rule(strokeWidth=3, strokeCap="round", color=alt.expr("muted"), opacity=0.55)
+    ring = base.mark_point(size=28, strokeWidth=1, opacity=0.8, color=alt.expr("muted"))
     dot = pooled.mark_circle(size=90, opacity=1, color=alt.expr("datum.rate > 0 ? danger : ink"))
-    count = pooled.mark_text(
-        fontSize=9, dy=-9, align=alt.expr("datum.rate > 0.1 ? 'right' : 'left'"), fill=alt.expr("ink")
-    )
-    ring = seeds.mark_point(size=28, strokeWidth=1, opacity=0.8, color=alt.expr("muted"))
+    side = alt.expr("datum.rate > 0.1 ? 'right' : 'left'")
     return (
         alt.layer(
-            band.encode(x=alt.X("low:Q", scale=scale), x2="high:Q", tooltip="tip:N"),
-            ring.encode(x=rate, tooltip="tip:N"),
-            dot.encode(x=rate, tooltip="tip:N"),
-            count.encode(x=rate, text="count:N"),
+            band.encode(x=alt.X("low:Q", scale=scale), x2="high:Q"),
+            ring.transform_filter("datum.seed !== null"),
+            dot,
+            pooled.mark_text(fontSize=9, dy=-9, align=side, fill=alt.expr("ink")).encode(text="count:N"),
         )
         .properties(width="container", height=alt.Step(26))
         .add_params(*colors())
@@ -113,17 +83,11 @@ def comparison(data: Any) -> Layers:
 
 
 def learning_curves(data: Any, scale: Literal["log", "linear"]) -> Layers:
-    """A metric over training steps, one line for every run.
-
-    Args:
-        data: rows with step, value, run and recipe.
-        scale: of the values.
-    """
-    tip = "datum.run + '\\nstep ' + datum.step + ': ' + datum.value"
+    """A metric over training steps, one line for every run, from rows with step, value, run and recipe."""
     values = alt.Scale(type=scale, zero=False, nice=False)
     base = (
         alt.Chart(data)
-        .transform_calculate(tip=tip)
+        .transform_calculate(tip="datum.run + '\\nstep ' + datum.step + ': ' + datum.value")
         .encode(
             x=alt.X("step:Q", title="step", axis=alt.Axis(grid=False, tickCount=5)),
             y=alt.Y("value:Q", title=None, scale=values, axis=alt.Axis(format="~g", tickCount=4, grid=False)),
@@ -139,13 +103,10 @@ def learning_curves(data: Any, scale: Literal["log", "linear"]) -> Layers:
 @functools.cache
 def specifications() -> dict[str, Any]:
     """Vega specifications of the page's charts, without data and colours."""
-    cells, recipes, points, frames = (alt.NamedData(name) for name in ("cells", "recipes", "points", "frames"))
-    return {
-        "heat": vega.compiled(heat_map(cells)),
-        "comparison": vega.compiled(comparison(recipes)),
-        "log": vega.compiled(learning_curves(points, "log")),
-        "linear": vega.compiled(learning_curves(points, "linear")),
-        "top": vega.compiled(encounter(frames, "y")),
-        "side": vega.compiled(encounter(frames, "z")),
-        "separation": vega.compiled(separation(frames)),
-    }
+    cells, rows, points, frames = (alt.NamedData(name) for name in ("cells", "recipes", "points", "frames"))
+    charts = {
+        "heat": heat_map(cells), "comparison": comparison(rows), "log": learning_curves(points, "log"),
+        "linear": learning_curves(points, "linear"), "top": encounter(frames, "y"), "side": encounter(frames, "z"),
+        "separation": separation(frames),
+    }  # fmt: skip
+    return {name: vega.compiled(chart) for name, chart in charts.items()}

@@ -1,18 +1,15 @@
-"""An episode of episodes.json as a typed record."""
+"""An episode of episodes.json as a typed record, and what pictures and the player show of it."""
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, BeforeValidator, ConfigDict
 
-Array = NDArray[np.float64]
-
-
-def _array(value: Any) -> Array:
-    return np.asarray(value, dtype=np.float64)
+Array = Annotated[NDArray[np.float64], BeforeValidator(lambda value: np.asarray(value, dtype=np.float64))]
 
 
 class Episode(BaseModel):
@@ -28,14 +25,19 @@ class Episode(BaseModel):
     """Smallest value of -constraint."""
     cost: float | None = None
     label_cost: float | None = None
-    t: Annotated[Array, BeforeValidator(_array)]
+    t: Array
     """Time, s, (F,)."""
-    positions: Annotated[Array, BeforeValidator(_array)]
+    positions: Array
     """m, (F, P, d)."""
-    radius: Annotated[Array, BeforeValidator(_array)] | None = None
+    radius: Array | None = None
     """Distance below which it is a collision, m, (F,); None where the constraint is no distance."""
-    label_positions: Annotated[Array, BeforeValidator(_array)] | None = None
+    label_positions: Array | None = None
     """Positions along the equilibrium from the same start, m, (F, P, d)."""
+
+    @property
+    def order(self) -> float:
+        """What episodes are ranked by: those without a clearance come last."""
+        return math.inf if self.clearance is None else self.clearance
 
 
 def episode(content: Any) -> Episode:
@@ -45,22 +47,55 @@ def episode(content: Any) -> Episode:
         ValueError: arrays are missing or do not fit.
     """
     found = Episode.model_validate(content)
-    t, positions = found.t, found.positions
-    shapes = [None if array is None else array.shape for array in (t, positions, found.radius, found.label_positions)]
-    if t.ndim != 1 or positions.ndim != 3 or positions.shape[2] not in (2, 3):
-        raise ValueError(f"times and positions have shapes {shapes[:2]}, expected (F,) and (F, P, 2 or 3)")
-    if positions.shape[0] != len(t) or shapes[2] not in (None, t.shape) or shapes[3] not in (None, positions.shape):
-        raise ValueError(f"times, positions, radius and equilibrium have shapes {shapes}")
-    sound = np.isfinite(t) & np.isfinite(positions).all((1, 2))
-    sound &= True if found.radius is None else np.isfinite(found.radius)
-    end = len(t) if sound.all() else int(sound.argmin())
+    arrays = {name: value for name, value in found if isinstance(value, np.ndarray)}
+    places = (*found.t.shape, *found.positions.shape[1:])
+    wanted = {"t": places[:1], "positions": places, "radius": places[:1], "label_positions": places}
+    shapes = {name: array.shape for name, array in arrays.items()}
+    if len(places) != 3 or places[2] not in (2, 3) or any(shape != wanted[name] for name, shape in shapes.items()):
+        raise ValueError(f"arrays have shapes {shapes}, expected (F,) or (F, P, 2 or 3)")
+    sound = np.isfinite(found.t) & np.isfinite(found.positions).all((1, 2))
+    end = len(sound) if sound.all() else int(sound.argmin())
     if end == 0:
         raise ValueError("it has no finite frame")
-    return found.model_copy(update={name: _first(getattr(found, name), end) for name in _ARRAYS})
+    kept = {name: array[:end] for name, array in arrays.items()}
+    return found.model_copy(update={name: one if np.isfinite(one).all() else None for name, one in kept.items()})
 
 
-_ARRAYS = ("t", "positions", "radius", "label_positions")
+def distances(found: Episode) -> NDArray[np.float64] | None:
+    """Distance between the closest players, m, (F,); None for one player."""
+    players = found.positions.shape[1]
+    if players == 1:
+        return None
+    apart = np.linalg.norm(found.positions[:, :, None] - found.positions[:, None], axis=-1)
+    apart[:, range(players), range(players)] = np.inf
+    return apart.min((1, 2))
 
 
-def _first(values: Array | None, end: int) -> Array | None:
-    return None if values is None or not np.isfinite(values[:end]).all() else values[:end]
+def closest(found: Episode) -> int:
+    """The frame of the smallest distance above the collision radius; the last one of a single player."""
+    apart = distances(found)
+    if apart is None:
+        return len(found.t) - 1
+    return int((apart - (0 if found.radius is None else found.radius)).argmin())
+
+
+def frames(found: Episode) -> list[dict[str, Any]]:
+    """A row for every frame: frame, t (s), distance and radius (m, or None), and lists over players.
+
+    The lists are x, y and, in space, z; label_x and so on along the equilibrium, if that is known.
+    """
+    columns = {"t": found.t, "distance": distances(found), "radius": found.radius}
+    for prefix, path in (("", found.positions), ("label_", found.label_positions)):
+        if path is not None:
+            columns |= {f"{prefix}{axis}": path[..., i] for i, axis in enumerate("xyz"[: path.shape[2]])}
+    lists = [[None] * len(found.t) if one is None else one.round(3).tolist() for one in columns.values()]
+    return [{"frame": k, **dict(zip(columns, row, strict=True))} for k, row in enumerate(zip(*lists, strict=True))]
+
+
+def whole(found: Episode, up: int) -> dict[str, float]:
+    """Signals of `encounter`: everything that happens, with room for discs; `up` is the second axis, 1 or 2."""
+    paths = [path for path in (found.positions, found.label_positions) if path is not None]
+    places = np.concatenate(paths)[:, :, [0, up]]
+    room = 0.7 * (1.0 if found.radius is None else found.radius.max())
+    (left, bottom), (right, top) = (places.min((0, 1)) - room).tolist(), (places.max((0, 1)) + room).tolist()
+    return {"left": left, "right": right, "bottom": bottom, "top": top}

@@ -11,6 +11,7 @@ from hno.report.vega import Layers, colors
 
 WHOLE = {"left": 0.0, "right": 10.0, "bottom": 0.0, "top": 10.0}
 """Signals of `encounter`: the part of space in which everything happens, m."""
+STRUCK = "datum.radius !== null && datum.distance < datum.radius"
 
 
 def encounter(
@@ -18,64 +19,45 @@ def encounter(
 ) -> Layers:
     """Players on their way, seen from above or from the side, in true proportion.
 
-    The disc around a player has half the collision radius: discs that overlap are a collision.
-
-    Args:
-        frames: data named "frames", see `episodes.frames`.
-        up: the second axis.
-        frame: the one shown.
-        follow: whether to show what surrounds the players at that frame rather than everything.
-        whole: left, right, bottom and top of everything, m.
+    The disc around a player has half the collision radius: discs that overlap are a collision. In view is what
+    surrounds the players at the frame, or the whole. The data must be named "frames", see `episode.frames`.
     """
     params = [alt.param(name=name, value=value) for name, value in {"frame": frame, "follow": follow, **whole}.items()]
     params += [alt.param(name=name, expr=expression) for name, expression in _window(up).items()]
-    scales = [
-        alt.Scale(
-            domain=[alt.expr(f"{at} - {side} / metre / 2"), alt.expr(f"{at} + {side} / metre / 2")],
-            nice=False,
-            zero=False,
-        )
-        for at, side in (("middle_x", "width"), ("middle_y", "height"))
-    ]
-    x = alt.X("x:Q", title="x [m]", scale=scales[0], axis=alt.Axis(grid=False, tickCount=6))
-    y = alt.Y("y:Q", title=f"{up} [m]", scale=scales[1], axis=alt.Axis(grid=False, tickCount=4))
+    x = alt.X("x:Q", title="x [m]", scale=_scale("middle_x", "width"), axis=alt.Axis(grid=False, tickCount=6))
+    y = alt.Y("y:Q", title=f"{up} [m]", scale=_scale("middle_y", "height"), axis=alt.Axis(grid=False, tickCount=4))
     who, order = alt.Color("player:N", legend=None), alt.Order("frame:Q")
-    played = _paths(frames, "x", up).encode(x, y, who)
+    played, expected = (_paths(frames, f"{prefix}x", f"{prefix}{up}").encode(x, y) for prefix in ("", "label_"))
     now = played.transform_filter("datum.frame === frame")
-    expected = _paths(frames, "label_x", f"label_{up}").mark_line(
-        strokeDash=[5, 4], strokeWidth=1.5, opacity=0.55, clip=True
-    )
+    color = alt.expr(f"{STRUCK} ? danger : scale('color', datum.player)")
+    size, opacity = alt.expr("PI * pow(metre * datum.radius / 2, 2)"), alt.expr(f"{STRUCK} ? 0.5 : 0.22")
+    discs = now.mark_point(fill=color, stroke=color, size=size, fillOpacity=opacity, opacity=1, clip=True)
     trail = played.mark_line(strokeWidth=2.5, clip=True, strokeCap="round").transform_filter("datum.frame <= frame")
-    size = alt.expr("PI * pow(metre * datum.radius / 2, 2)")
-    own, danger = alt.expr("scale('color', datum.player)"), alt.expr("danger")
-    apart = now.transform_filter("datum.distance >= datum.radius && datum.radius !== null")
-    struck = now.transform_filter("datum.distance < datum.radius && datum.radius !== null")
     return (
         alt.layer(
-            expected.encode(x, y, who, order),
-            trail.encode(order),
-            apart.mark_point(filled=True, stroke=own, size=size, fillOpacity=0.22, opacity=1, clip=True),
-            struck.mark_point(fill=danger, stroke=danger, size=size, fillOpacity=0.5, opacity=1, clip=True).encode(
-                color=alt.Undefined
-            ),
-            now.mark_point(filled=True, size=30, opacity=1, clip=True),
+            expected.mark_line(strokeDash=[5, 4], strokeWidth=1.5, opacity=0.55, clip=True).encode(who, order),
+            trail.encode(who, order),
+            discs.transform_filter("datum.radius !== null"),
+            now.mark_point(filled=True, size=30, opacity=1, clip=True).encode(who),
         )
         .properties(width=420, height=170)
         .add_params(*colors(), *params)
     )
 
 
+def _scale(middle: str, side: str) -> alt.Scale:
+    ends = [alt.expr(f"{middle} {sign} {side} / metre / 2") for sign in "-+"]
+    return alt.Scale(domain=ends, nice=False, zero=False)
+
+
 def _window(up: str) -> dict[str, str]:
     """Signals for the part of space in view: its middle, and the px of a metre."""
     now = "data('frames')[frame]"
     room = f"1.5 * ({now}.radius || 1)"
-    span = {
-        f"near_{axis}": f"[extent({now}.{field})[0] - {room}, extent({now}.{field})[1] + {room}]"
-        for axis, field in (("x", "x"), ("y", up))
-    }
-    return span | {
-        "shown_x": "follow ? near_x : [left, right]",
-        "shown_y": "follow ? near_y : [bottom, top]",
+    near_x, near_y = (f"[extent({now}.{axis})[0] - {room}, extent({now}.{axis})[1] + {room}]" for axis in ("x", up))
+    return {
+        "shown_x": f"follow ? {near_x} : [left, right]",
+        "shown_y": f"follow ? {near_y} : [bottom, top]",
         "metre": "min(width / (shown_x[1] - shown_x[0]), height / (shown_y[1] - shown_y[0]))",
         "middle_x": "(shown_x[0] + shown_x[1]) / 2",
         "middle_y": "(shown_y[0] + shown_y[1]) / 2",
@@ -92,26 +74,23 @@ def _paths(frames: Any, x: str, y: str) -> alt.Chart:
     )
 
 
-def separation(frames: Any, frame: int = 0, reach: float = 10.0) -> Layers:
-    """Distance between players over time, with the distance below which it is a collision.
-
-    Args:
-        frames: see `episodes.frames`.
-        frame: the one marked.
-        reach: largest distance shown, m.
-    """
+def separation(frames: Any, frame: int = 0) -> Layers:
+    """Distance between players over time, up to six times that below which it is a collision; one frame is marked."""
+    far, radius = (f"extent(pluck(data('frames'), '{name}'))[1]" for name in ("distance", "radius"))
+    reach = alt.param(name="reach", expr=f"isValid({radius}) ? min({far}, 6 * {radius}) : {far}")
     base = alt.Chart(frames).encode(x=alt.X("t:Q", title="t [s]", axis=alt.Axis(grid=False, tickCount=5)))
     scale = alt.Scale(domain=[0, alt.expr("reach")], nice=False)
     height = alt.Y("distance:Q", title="distance [m]", scale=scale, axis=alt.Axis(grid=False, tickCount=4))
-    forbidden = base.mark_area(color=alt.expr("danger"), opacity=0.12).encode(y="radius:Q")
-    edge = base.mark_line(color=alt.expr("danger"), strokeWidth=1.2).encode(y="radius:Q")
-    line = base.mark_line(color=alt.expr("ink"), strokeWidth=1.8, clip=True).encode(y=height)
     now = base.transform_filter("datum.frame === frame")
-    cursor = now.mark_rule(color=alt.expr("muted"), strokeDash=[3, 3])
-    near = "datum.radius !== null && datum.distance < datum.radius ? danger : ink"
-    dot = now.mark_circle(size=60, opacity=1, clip=True, color=alt.expr(near)).encode(y=height)
+    dot = now.mark_circle(size=60, opacity=1, clip=True, color=alt.expr(f"{STRUCK} ? danger : ink"))
     return (
-        alt.layer(forbidden, edge, line, cursor, dot)
+        alt.layer(
+            base.mark_area(color=alt.expr("danger"), opacity=0.12).encode(y="radius:Q"),
+            base.mark_line(color=alt.expr("danger"), strokeWidth=1.2).encode(y="radius:Q"),
+            base.mark_line(color=alt.expr("ink"), strokeWidth=1.8, clip=True).encode(y=height),
+            now.mark_rule(color=alt.expr("muted"), strokeDash=[3, 3]),
+            dot.encode(y=height),
+        )
         .properties(width="container", height=110)
-        .add_params(*colors(), alt.param(name="frame", value=frame), alt.param(name="reach", value=reach))
+        .add_params(*colors(), alt.param(name="frame", value=frame), reach)
     )

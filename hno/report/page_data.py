@@ -3,71 +3,88 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any
 
 import numpy as np
 
-from hno.evaluation.format import counted
-from hno.evaluation.sections import plain
-from hno.report.recipes import Recipe, TypeCounts, pool
+from hno.evaluation.format import interval, percent, signed
+from hno.report.episode import Episode, closest, frames, whole
+from hno.report.recipes import Recipe
 from hno.report.records import Run
-from hno.report.tables import names_of
-from hno.report.verdicts import at, rate
+from hno.report.tables import Row, names_of
+from hno.report.verdicts import at, clearance, seeds, share
 
 POINTS = 120
 """Points of a learning curve, at most."""
 
 
-def cells(rows: Sequence[TypeCounts]) -> list[dict[str, Any]]:
-    """Rows of a heat map."""
-    return [
-        one._asdict()
-        | {
-            "interval": one.interval and [round(bound, 5) for bound in one.interval],
-            "relative_excess": None if one.relative_excess is None else round(one.relative_excess, 4),
-            "rate": None if one.rate is None else round(one.rate, 6),
-        }
-        for one in rows
-    ]
+def cells(types: Iterable[Row]) -> list[Row]:
+    """Rows of `recipes.by_type` with texts for a heat map."""
+    return [{**one, "tip": _tip(one)} for one in types]
 
 
-def comparison(recipes: Iterable[Recipe]) -> list[dict[str, Any]]:
-    """Pooled rates of recipes and those of their seeds, safest first."""
-    played = [recipe for recipe in recipes if recipe.pooled.safe_starts]
-    return [entry for recipe in sorted(played, key=lambda one: one.pooled.rate or 0.0) for entry in _compared(recipe)]
+def _tip(one: Row) -> str:
+    labels = "seen in training" if one["seen"] else "without training labels"
+    lines = [f"types {at(one['theta'])}, {labels}"]
+    lines += ["outside the range that the game is made for: extrapolated"] if one["extrapolated"] else []
+    counts = f"{one['collisions']} of {one['safe_starts']} safe starts collide: {percent(one['rate'])}"
+    lines += (
+        [counts, f"95 % interval {interval(one['interval'])}"] if one["safe_starts"] else ["no safe start: rate n/a"]
+    )
+    return "\n".join([*lines, f"median excess cost {signed(one['relative_excess'])}"])
 
 
-def _compared(recipe: Recipe) -> list[dict[str, Any]]:
-    names = {**names_of(recipe, "any"), "recipe": recipe.name}
-    whole = recipe.pooled
-    low, high = whole.interval or (None, None)
-    tip = f"{recipe.name}, {counted(len(recipe.runs), 'seed')}\n{rate(whole)}"
+def comparison(recipes: Iterable[Recipe]) -> list[Row]:
+    """Pooled rates of recipes with their intervals, each followed by those of its seeds; safest first."""
+    played = sorted((one for one in recipes if one.pooled.safe_starts), key=lambda one: one.pooled.rate or 0.0)
+    return [{**names_of(recipe), "recipe": recipe.name, **row} for recipe in played for row in _rates(recipe)]
+
+
+def _rates(recipe: Recipe) -> list[Row]:
+    whole, (low, high) = recipe.pooled, recipe.pooled.interval or (None, None)
+    tip = f"{recipe.name}, {seeds(recipe)}\n{share(whole)}\n95 % interval {interval(whole.interval)}"
     count = f"{whole.collisions:,} of {whole.safe_starts:,}"
-    pooled = {"seed": None, "rate": whole.rate, "low": low, "high": high, "count": count, "tip": tip}
-    return [{**names, **pooled}, *({**names, **_seed(run)} for run in recipe.runs)]
+    rows: list[Row] = [{"seed": None, "rate": whole.rate, "low": low, "high": high, "count": count, "tip": tip}]
+    for run, own in zip(recipe.runs, recipe.by_seed, strict=True):
+        worst = f"\nworst type {at(own.worst_theta)}" if own.worst_theta else ""
+        rows.append({"seed": run.seed, "rate": own.rate, "tip": f"seed {run.seed}: {share(own)}{worst}"})
+    return rows
 
 
-def _seed(run: Run) -> dict[str, Any]:
-    whole, seed = pool(run.table), plain(run.seed)
-    worst = "" if whole.worst_theta is None else f"\nworst type {at(whole.worst_theta)}"
-    return {"seed": seed, "rate": whole.rate, "tip": f"seed {seed}: {rate(whole)}{worst}"}
-
-
-def learning_curves(recipes: Iterable[Recipe], runs: Iterable[Run]) -> list[dict[str, Any]]:
+def learning_curves(recipes: Iterable[Recipe], runs: Iterable[Run]) -> list[Row]:
     """Metrics of every run by step, thinned out evenly."""
     names = {run.name: recipe.name for recipe in recipes for run in recipe.runs}
     return [
         {
-            **names_of(run, "any"),
-            "run": run.name,
-            "recipe": names.get(run.name, f"{run.operator} / {run.activation}"),
+            **names_of(run), "run": run.name, "recipe": names.get(run.name, f"{run.operator} / {run.activation}"),
             "metrics": {name: _thinned(curve) for name, curve in sorted(run.curves.items())},
         }
         for run in runs
         if run.curves
-    ]
+    ]  # fmt: skip
 
 
-def _thinned(curve: Sequence[tuple[int, float]]) -> list[list[float]]:
-    kept = np.unique(np.linspace(0, len(curve) - 1, min(POINTS, len(curve))).round().astype(int))
-    return [[curve[k][0], float(f"{curve[k][1]:.4g}")] for k in kept]
+def _thinned(curve: Sequence[tuple[int, float]]) -> list[tuple[int, float]]:
+    kept = np.linspace(0, len(curve) - 1, min(POINTS, len(curve))).round().astype(int)
+    return [curve[k] for k in kept]
+
+
+def ranked(runs: Iterable[Run]) -> list[tuple[Run, Episode]]:
+    """Every episode: the worst of every run first, then a typical one of every run, then by clearance."""
+    ordered = []
+    for run in runs:
+        own = sorted(run.episodes, key=lambda one: one.order)
+        first = [next((one for one in own if one.kind == kind), None) for kind in ("worst", "typical")]
+        ordered += [(next((k for k, e in enumerate(first) if e is one), 2), one.order, run, one) for one in own]
+    return [(run, one) for *_, run, one in sorted(ordered, key=lambda entry: entry[:2])]
+
+
+def playable(run: Run, found: Episode) -> Row:
+    """What the page's player gets of an episode."""
+    title = f"{run.name} · {at(found.theta)} · {found.kind}{' · collision' if found.collided else ''}"
+    costs = ["n/a" if value is None else f"{value:.1f}" for value in (found.cost, found.label_cost)]
+    near = clearance(found, run.constraint_unit)
+    said = f"{run.name}, types {at(found.theta)}, {found.kind}: {near}. "
+    said += f"Joint cost {costs[0]}, the equilibrium's {costs[1]}."
+    views = {name: whole(found, up) for up, name in enumerate(("top", "side")[: found.positions.shape[2] - 1], start=1)}
+    return {**names_of(run), "title": title, "said": said, "collided": found.collided, "closest": closest(found),
+            "frames": frames(found), "whole": views}  # fmt: skip

@@ -7,13 +7,12 @@ import math
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from scipy.stats import t as student
 
 from hno.evaluation.closed_loop import TypeRow
 from hno.evaluation.format import NOT_AVAILABLE
-from hno.evaluation.metrics import clopper_pearson
 from hno.evaluation.outcome import Pooled, pooled
 from hno.report.records import Run
 
@@ -23,8 +22,6 @@ SHOWN = 3
 """Differing settings that are named in a recipe's label."""
 Comparable = tuple[str, str, frozenset[tuple[float, ...]]]
 """What recipes share whose numbers may be compared: game, changed constants and conditions of play, and types."""
-
-interval = functools.cache(clopper_pearson)
 
 
 class Spread(NamedTuple):
@@ -43,53 +40,32 @@ def spread(values: Iterable[float | None]) -> Spread | None:
     found = [value for value in values if value is not None]
     if not found:
         return None
-    mean, count = math.fsum(found) / len(found), len(found)
-    bounds = None
+    mean, count, bounds = math.fsum(found) / len(found), len(found), None
     if count > 1:
         half = float(student.ppf(0.975, count - 1)) * statistics.stdev(found) / math.sqrt(count)
         bounds = (mean - half, mean + half)
     return Spread(mean, bounds, min(found), max(found), count)
 
 
-class TypeCounts(NamedTuple):
-    """One type over one or several seeds."""
-
-    theta: tuple[float, ...]
-    seen: bool
-    """Whether the operator was trained with labels of these types."""
-    extrapolated: bool
-    """Whether the types lie outside the range that the game is made for."""
-    collisions: int
-    safe_starts: int
-    rate: float | None
-    """Collisions per safe start."""
-    interval: tuple[float, float] | None
-    """Clopper-Pearson 95 % interval of the rate."""
-    relative_excess: float | None
-    """Median over seeds of (median joint cost above the equilibrium's) / (median of the equilibrium's)."""
-
-
-def by_type(rows: Iterable[TypeRow]) -> list[TypeCounts]:
-    """Rows of one or several tables as one line per type, counts pooled."""
-    groups: dict[tuple[float, ...], list[TypeRow]] = {}
-    for row in rows:
-        groups.setdefault(row.theta, []).append(row)
-    return [_together(theta, same) for theta, same in sorted(groups.items())]
-
-
-def _together(theta: tuple[float, ...], same: Sequence[TypeRow]) -> TypeCounts:
-    hits, starts = (sum(getattr(row.outcome, name) for row in same) for name in ("collisions", "safe_starts"))
-    costs = [(row.outcome.median_excess_cost, row.outcome.median_label_cost) for row in same]
-    ratios = [above / abs(cost) for above, cost in costs if above is not None and cost]
-    return TypeCounts(
-        theta, any(row.seen for row in same), any(row.extrapolated for row in same), hits, starts,
-        hits / starts if starts else None, interval(hits, starts), statistics.median(ratios) if ratios else None,
-    )  # fmt: skip
-
-
 def pool(rows: Iterable[TypeRow]) -> Pooled:
     """Rows of one or several tables in one line."""
     return pooled([row.content() for row in rows])
+
+
+def by_type(rows: Iterable[TypeRow]) -> list[dict[str, Any]]:
+    """Rows of one or several tables as one line per type.
+
+    Returns:
+        "theta", "seen" and "extrapolated" as in `TypeRow`, and the entries of `Pooled` over seeds.
+    """
+    groups: dict[tuple[float, ...], list[TypeRow]] = {}
+    for row in rows:
+        groups.setdefault(row.theta, []).append(row)
+    return [
+        {"theta": theta, **{flag: any(getattr(row, flag) for row in same) for flag in ("seen", "extrapolated")}}
+        | pool(same)._asdict()
+        for theta, same in sorted(groups.items())
+    ]
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,8 +77,6 @@ class Recipe:
     activation: str
     variant: str
     """Settings in which it differs from others of the same names; empty if there are none."""
-    special: str
-    """Changed constants of the game and how episodes were played, as far as that is not usual; empty if it is."""
     runs: tuple[Run, ...]
     """One finished run for every seed."""
     repeated: tuple[Run, ...]
@@ -114,6 +88,11 @@ class Recipe:
     def name(self) -> str:
         """Operator, activation and what else is special."""
         return " / ".join(filter(None, (self.operator, self.activation, self.variant)))
+
+    @property
+    def special(self) -> str:
+        """Changed constants of the game and how episodes were played, as far as that is not usual."""
+        return ", ".join(sorted({text for run in self.runs for text in (_constants(run), run.conditions)} - {""}))
 
     @property
     def conditions(self) -> str:
@@ -128,8 +107,8 @@ class Recipe:
         return self.game, self.special, frozenset(row.theta for run in self.runs for row in run.table)
 
     @functools.cached_property
-    def types(self) -> list[TypeCounts]:
-        """One line per type over all seeds."""
+    def types(self) -> list[dict[str, Any]]:
+        """One line per type over all seeds, see `by_type`."""
         return by_type(row for run in self.runs for row in run.table)
 
     @functools.cached_property
@@ -140,7 +119,7 @@ class Recipe:
     @functools.cached_property
     def pooled(self) -> Pooled:
         """Counts over all types and seeds; the worst type is that of the pooled counts."""
-        return pooled([counts._asdict() for counts in self.types])
+        return pooled(self.types)
 
     @property
     def rates(self) -> Spread | None:
@@ -154,19 +133,12 @@ class Recipe:
 
     def seconds(self, stage: str) -> Spread | None:
         """Time that a stage took over seeds, s; "total" is the sum of all."""
-        return spread(seconds(run, stage) for run in self.runs)
-
-
-def seconds(run: Run, stage: str) -> float | None:
-    """Time that a stage of a run took, s; "total" is the sum of all."""
-    if stage == "total":
-        return math.fsum(run.seconds.values()) if run.seconds else None
-    return run.seconds.get(stage)
+        return spread(run.spent(stage) for run in self.runs)
 
 
 def recipes(runs: Sequence[Run]) -> list[Recipe]:
     """Group runs whose settings are equal but for the seed."""
-    groups: dict[tuple[str, ...], dict[tuple[tuple[str, str], ...], list[Run]]] = {}
+    groups: dict[tuple[str, str, str], dict[tuple[tuple[str, str], ...], list[Run]]] = {}
     for run in runs:
         names = (run.game, run.operator, run.activation)
         groups.setdefault(names, {}).setdefault(tuple(sorted(_relevant(run).items())), []).append(run)
@@ -188,58 +160,42 @@ def _variants(settings: Sequence[Mapping[str, str]]) -> list[str]:
     keys = sorted({key for one in settings for key in one})
     differing = [key for key in keys if len({one.get(key) for one in settings}) > 1]
     more = [f"{len(differing) - SHOWN} more"] if len(differing) > SHOWN else []
-    return [", ".join([f"{key}={_short(one.get(key))}" for key in differing[:SHOWN]] + more) for one in settings]
+    ends = [{key: "/".join(one.get(key, NOT_AVAILABLE).split("/")[-3:]) for key in differing} for one in settings]
+    return [", ".join([f"{key}={one[key]:.40}" for key in differing[:SHOWN]] + more) for one in ends]
 
 
-def _short(text: str | None) -> str:
-    """A setting for a label: the last three names of a path, the beginning of anything else."""
-    if text is None:
-        return NOT_AVAILABLE
-    return "/".join(text.split("/")[-3:]) if "/" in text else text[:40]
-
-
-def _recipe(names: tuple[str, ...], variant: str, runs: Sequence[Run]) -> Recipe:
-    last = {(run.seed, run.test_seed): run for run in runs if run.finished}
-    counted = tuple(last.values())
-    repeated = tuple(run for run in runs if run.finished and all(run is not other for other in counted))
+def _recipe(names: tuple[str, str, str], variant: str, runs: Sequence[Run]) -> Recipe:
+    finished = [run for run in runs if run.finished]
+    counted = tuple({(run.seed, run.test_seed): run for run in finished}.values())
+    repeated = tuple(run for run in finished if all(run is not other for other in counted))
     failed = sum(run.status == "failed" for run in runs)
-    unfinished = len(runs) - len(counted) - len(repeated) - failed
-    special = ", ".join(sorted({text for run in counted for text in (_constants(run), run.conditions)} - {""}))
-    game, operator, activation = names
-    return Recipe(game, operator, activation, variant, special, counted, repeated, unfinished, failed)
+    return Recipe(*names, variant, counted, repeated, len(runs) - len(finished) - failed, failed)
 
 
 def _constants(run: Run) -> str:
-    changed = {key: text for key, text in sorted(run.settings.items()) if key.startswith("game.constants.")}
-    return ", ".join(f"{key.removeprefix('game.constants.')} {text}" for key, text in changed.items())
+    prefix = "game.constants."
+    return ", ".join(f"{key[len(prefix) :]} {text}" for key, text in sorted(run.settings.items()) if prefix in key)
 
 
-def best(found: Iterable[Recipe]) -> dict[Comparable, Recipe]:
-    """The recipe with the lowest collision rate, then the lowest excess cost, of all that may be compared."""
+def best(found: Iterable[Recipe]) -> list[Recipe]:
+    """By game: the recipe with the lowest collision rate, then the lowest excess cost, of all that may be compared."""
     chosen: dict[Comparable, Recipe] = {}
     for recipe in sorted((one for one in found if one.pooled.safe_starts), key=_order):
         chosen.setdefault(recipe.comparable, recipe)
-    return chosen
+    return sorted(chosen.values(), key=lambda recipe: recipe.game)
 
 
 def _order(recipe: Recipe) -> tuple[float, float]:
     return recipe.pooled.rate or 0.0, math.inf if recipe.excess is None else recipe.excess.mean
 
 
-def headline(found: Iterable[Recipe]) -> Recipe:
+def headline(found: Iterable[Recipe]) -> Recipe | None:
     """Of the best recipes of a game the one at its usual constants and conditions, then at the most types."""
-    return min(found, key=lambda one: (bool(one.special), -len(one.comparable[2]), *_order(one)))
+    return min(found, key=lambda one: (bool(one.special), -len(one.comparable[2]), *_order(one)), default=None)
 
 
 def rivals(chosen: Recipe, found: Iterable[Recipe]) -> list[Recipe]:
     """Recipes that may be compared with the chosen one and whose interval of the collision rate overlaps its own."""
     bounds = chosen.pooled.interval
-    assert bounds is not None
-    return [
-        other
-        for other in found
-        if other is not chosen
-        and other.comparable == chosen.comparable
-        and other.pooled.interval is not None
-        and other.pooled.interval[0] <= bounds[1]
-    ]
+    others = (other for other in found if other is not chosen and other.comparable == chosen.comparable)
+    return [other for other in others if bounds and other.pooled.interval and other.pooled.interval[0] <= bounds[1]]

@@ -1,13 +1,11 @@
-"""What results.json and csv/metrics.csv hold, as typed records."""
+"""What results.json holds, as typed records."""
 
 from __future__ import annotations
 
-import csv
 import json
 import math
-from collections.abc import Callable, Iterable, Mapping
-from pathlib import Path
-from typing import Any, TypeVar
+from collections.abc import Mapping
+from typing import Any
 
 from pydantic import BaseModel, ConfigDict, SkipValidation, TypeAdapter, ValidationError
 
@@ -16,15 +14,10 @@ from hno.evaluation.format import NOT_AVAILABLE
 from hno.evaluation.outcome import Outcome
 from hno.report.episode import Episode
 
-T = TypeVar("T")
 Curves = dict[str, list[tuple[int, float]]]
 """Metric -> step and value."""
 PLAY = ("clearance", "dt", "widen", "noise", "delay")
 """Fields of `Run` that say how episodes were played; their defaults go without saying."""
-
-
-class UnreadableError(ValueError):
-    """A file that is not what it should be; the message says what is wrong with it."""
 
 
 class Run(BaseModel):
@@ -83,50 +76,12 @@ class Run(BaseModel):
         """Entries of results.json that have no field, such as sections of an evaluation."""
         return self.model_extra or {}
 
+    def spent(self, stage: str) -> float | None:
+        """Time that a stage took, s; "total" is the sum of all."""
+        return self.seconds.get(stage, math.fsum(self.seconds.values()) if stage == "total" and self.seconds else None)
+
 
 _ROW = TypeAdapter(TypeRow, config=ConfigDict(strict=True, allow_inf_nan=False))
-
-
-def read_results(path: Path) -> list[dict[str, Any]]:
-    """The models of a results.json, each as if it were alone in its file.
-
-    Raises:
-        UnreadableError: it is missing, no JSON, or no results of hno.
-    """
-    content = read_json(path)
-    if not isinstance(content, dict):
-        raise UnreadableError(f"{path.name} is not hno's: expected an object, got a {type(content).__name__}")
-    models = content.pop("models", None) or [{}]
-    shared = {key: value for key, value in content.items() if key not in ("episodes", "comparison")}
-    return [{**content, **models[0]}, *({**shared, **model} for model in models[1:])]
-
-
-def read_json(path: Path) -> Any:
-    """Content of a JSON file.
-
-    Raises:
-        UnreadableError: it is missing, or no JSON.
-    """
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise UnreadableError(f"{path.name} cannot be read ({error.strerror})") from error
-    except (ValueError, RecursionError) as error:
-        raise UnreadableError(f"{path.name} is not JSON ({error})") from error
-
-
-def run_of(content: Mapping[str, Any], file: str) -> Run:
-    """The record of a model, with its rows and remarks about those that are left out.
-
-    Raises:
-        UnreadableError: an entry is not what it should be.
-    """
-    try:
-        run = Run.model_validate_json(json.dumps(content))
-    except ValidationError as error:
-        raise UnreadableError(f"{file} is not hno's: {sentence(error)}") from error
-    table, notes = each(run.table, type_row, "row of the table")
-    return run.model_copy(update={"table": table, "notes": notes})
 
 
 def type_row(content: Any) -> TypeRow:
@@ -145,58 +100,11 @@ def type_row(content: Any) -> TypeRow:
     return row
 
 
-def each(entries: Any, read: Callable[[Any], T], what: str) -> tuple[list[T], list[str]]:
-    """Records of a list, and remarks about its entries that are none."""
-    if not isinstance(entries, list):
-        return [], [f"expected a list of each {what}; got {entries!r:.60}"]
-    found, notes = list[T](), list[str]()
-    for entry in entries:
-        try:
-            found.append(read(entry))
-        except ValueError as error:
-            said = sentence(error) if isinstance(error, ValidationError) else error
-            notes.append(f"a {what} is left out: {said}")
-    return found, notes
-
-
-def sentence(error: ValidationError) -> str:
-    """The first thing that is wrong."""
+def sentence(error: Exception) -> str:
+    """What is wrong; of several entries that do not fit, the first."""
+    if not isinstance(error, ValidationError):
+        return str(error)
     first = error.errors()[0]
     place = ".".join(str(step) for step in first["loc"]) or "content"
     found = "" if first["type"] == "missing" else f", got {first['input']!r:.60}"
     return f"{place}: {first['msg'][0].lower()}{first['msg'][1:]}{found}"
-
-
-def curves(path: Path) -> Curves:
-    """Metrics of a CSV file by step; lines that are cut off are left out.
-
-    Raises:
-        UnreadableError: no CSV file with a column "step".
-    """
-    try:
-        with path.open(encoding="utf-8", newline="") as file:
-            lines = csv.DictReader(file)
-            if "step" not in (lines.fieldnames or ()):
-                raise UnreadableError(f"{path.name} has no column 'step'")
-            return _by_metric(lines)
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise UnreadableError(f"{path.name} cannot be read ({error})") from error
-
-
-def _by_metric(lines: Iterable[Mapping[str | Any, str | Any]]) -> Curves:
-    found: Curves = {}
-    for line in lines:
-        step = _decimal(line["step"])
-        for name, text in line.items():
-            value = _decimal(text)
-            if isinstance(name, str) and name not in ("step", "epoch") and step is not None and value is not None:
-                found.setdefault(name, []).append((int(step), value))
-    return found
-
-
-def _decimal(text: Any) -> float | None:
-    try:
-        value = float(text)
-    except (TypeError, ValueError):
-        return None
-    return value if math.isfinite(value) else None

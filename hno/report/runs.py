@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
-import functools
+import csv
 import json
 import math
-from collections.abc import Mapping
+import shlex
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
-from hno.report.episode import Episode, episode
-from hno.report.hydra_files import command_of, read_yaml, sweep_of
-from hno.report.records import Curves, Run, UnreadableError, curves, each, read_json, read_results, run_of
+from yaml import YAMLError, safe_load  # type: ignore[import-untyped]  # yaml has no annotations
 
-RESULTS, METRICS, EPISODES = "results.json", "csv/metrics.csv", "episodes.json"
+from hno.report.episode import episode
+from hno.report.records import Curves, Run, sentence, type_row
+
+T = TypeVar("T")
+RESULTS, METRICS = "results.json", "csv/metrics.csv"
+
+
+class UnreadableError(ValueError):
+    """A file that is not what it should be; the message says what is wrong with it."""
 
 
 class NoRunsError(ValueError):
@@ -35,8 +43,6 @@ class Sweep(NamedTuple):
     skipped: tuple[Skipped, ...]
     command: str | None
     """The command line of the whole sweep; None for single runs."""
-    planned: int | None
-    """How many jobs it has; None where that is not known."""
 
 
 def load(root: Path) -> Sweep:
@@ -53,14 +59,13 @@ def load(root: Path) -> Sweep:
     for folder in _candidates(root):
         name = root.resolve().name if folder == root else folder.relative_to(root).as_posix()
         try:
-            runs += _unchanged(folder, name, _times(folder))
+            runs += _runs(folder, name)
         except UnreadableError as error:
             skipped.append(Skipped(name, str(error)))
     if not runs:
         found = "; ".join(f"{entry.name}: {entry.reason}" for entry in skipped[:3]) or f"no {RESULTS} in it or below"
         raise NoRunsError(f"{root} holds no run ({found}). Runs are written by train.py and evaluate.py.")
-    command, planned = sweep_of(root / "multirun.yaml")
-    return Sweep(root.resolve().name, tuple(runs), tuple(skipped), command, planned)
+    return Sweep(root.resolve().name, tuple(runs), tuple(skipped), _command(root / "multirun.yaml", "-m"))
 
 
 def _candidates(root: Path) -> list[Path]:
@@ -74,72 +79,114 @@ def _natural(path: Path) -> list[tuple[float, str]]:
     return [(float(head) if head.isdecimal() else math.inf, part) for head, part in heads]
 
 
-def _times(folder: Path) -> tuple[int, ...]:
-    """When each file was last changed, ns; 0 for one that does not exist."""
-    paths = (folder / name for name in (RESULTS, METRICS, EPISODES))
-    return tuple(path.stat().st_mtime_ns if path.exists() else 0 for path in paths)
-
-
-@functools.lru_cache(maxsize=1000)
-def _unchanged(folder: Path, name: str, times: tuple[int, ...]) -> list[Run]:
-    """Runs of a folder that has not changed since are not read again."""
-    return read_runs(folder, name)
-
-
-def read_runs(folder: Path, name: str) -> list[Run]:
-    """The run of a folder, or one for each model of an evaluation; what cannot be read beside it is left out and noted.
+def _runs(folder: Path, name: str) -> list[Run]:
+    """The run of a folder, or one for each model of an evaluation.
 
     Raises:
         UnreadableError: it has no results, or foreign ones.
     """
     if not (folder / RESULTS).exists():
         raise UnreadableError(f"no {RESULTS}: the job has only begun, or ended before it could write any")
-    models = read_results(folder / RESULTS)
+    content = _json(folder / RESULTS)
+    models = content.pop("models", None) or [{}]
+    shared = {key: value for key, value in content.items() if key not in ("episodes", "comparison")}
     names = [name] if len(models) == 1 else [f"{name} [{k}]" for k in range(len(models))]
-    return [_run(folder, name, content) for name, content in zip(names, models, strict=True)]
+    return [
+        _run(folder, name, {**(shared if k else content), **model})
+        for k, (name, model) in enumerate(zip(names, models, strict=True))
+    ]
+
+
+def _json(path: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UnreadableError(f"{path.name} cannot be read ({error.strerror})") from error
+    except (ValueError, RecursionError) as error:
+        raise UnreadableError(f"{path.name} is not JSON ({error})") from error
+    if not isinstance(content, dict):
+        raise UnreadableError(f"{path.name} is not hno's: expected an object, got a {type(content).__name__}")
+    return content
 
 
 def _run(folder: Path, name: str, content: Mapping[str, Any]) -> Run:
-    run = run_of(content, RESULTS)
-    settings, said = _settings(folder, run)
-    metrics, missed = _curves(folder / METRICS)
-    played, unplayed = _episodes(folder, content.get("episodes"))
-    found = {"settings": settings, "curves": metrics, "episodes": played, "command": command_of(folder)}
-    return run.model_copy(update={"name": name, **found, "notes": [*run.notes, *said, *missed, *unplayed]})
-
-
-def _settings(folder: Path, run: Run) -> tuple[dict[str, str], list[str]]:
+    """A model with what lies beside its results; what cannot be read there is left out and noted."""
     try:
-        config = run.config or read_yaml(folder / ".hydra" / "config.yaml")
-    except UnreadableError as error:
-        return {}, [f"no settings: {error}"]
-    found = flatten(config) if isinstance(config, dict) else {}
-    return found | ({"checkpoint": str(run.checkpoint)} if "checkpoint" in found else {}), []
+        run = Run.model_validate({**content, "episodes": []})
+    except ValueError as error:
+        raise UnreadableError(f"{RESULTS} is not hno's: {sentence(error)}") from error
+    notes, metrics, episodes = list[str](), folder / METRICS, content.get("episodes")
+    found: dict[str, Any] = {"name": name, "notes": notes, "settings": _settings(run)}
+    found["command"] = _command(folder / ".hydra" / "hydra.yaml")
+    found["table"] = _each(run.table, type_row, "row of the table", notes)
+    with _noted(notes, "no learning curves"):
+        found["curves"] = _curves(metrics) if metrics.exists() else {}
+    with _noted(notes, "no episodes"):  # a name inside the folder, whatever the file says
+        played = _json(folder / Path(episodes).name).get("episodes") if isinstance(episodes, str) else []
+        found["episodes"] = _each(played, episode, "episode", notes)
+    return run.model_copy(update=found)
 
 
-def _curves(path: Path) -> tuple[Curves, list[str]]:
+@contextmanager
+def _noted(notes: list[str], what: str) -> Iterator[None]:
+    """What cannot be read becomes a note."""
     try:
-        return curves(path) if path.exists() else {}, []
-    except UnreadableError as error:
-        return {}, [f"no learning curves: {error}"]
+        yield
+    except (ValueError, OSError, csv.Error) as error:
+        notes.append(f"{what}: {sentence(error)}")
 
 
-def _episodes(folder: Path, file: Any) -> tuple[list[Episode], list[str]]:
-    if not isinstance(file, str):
-        return [], []
+def _each(entries: Any, read: Callable[[Any], T], what: str, notes: list[str]) -> list[T]:
+    """Records of a list; entries that are none are noted."""
+    if not isinstance(entries, list):
+        notes.append(f"expected a list of each {what}; got {entries!r:.60}")
+        return []
+    found = list[T]()
+    for entry in entries:
+        with _noted(notes, f"a {what} is left out"):
+            found.append(read(entry))
+    return found
+
+
+def _curves(path: Path) -> Curves:
+    """Metrics of a CSV file by step; cells without a finite number and lines that are cut off are left out."""
+    found: Curves = {}
+    with path.open(encoding="utf-8", newline="") as file:
+        for line in csv.DictReader(file, restkey="epoch"):
+            step = _decimal(line.get("step"))
+            values = {name: _decimal(text) for name, text in line.items() if name not in ("step", "epoch")}
+            for name, value in values.items():
+                if step is not None and value is not None:
+                    found.setdefault(name, []).append((int(step), value))
+    return found
+
+
+def _decimal(text: str | None) -> float | None:
     try:
-        content = read_json(folder / Path(file).name)  # a name inside the folder, whatever the file says
-    except UnreadableError as error:
-        return [], [f"no episodes: {error}"]
-    return each(content.get("episodes") if isinstance(content, dict) else content, episode, "episode")
+        value = float(text or "nan")
+    except ValueError:
+        return None
+    return value if math.isfinite(value) else None
 
 
-def flatten(value: Any, prefix: str = "") -> dict[str, str]:
+def _settings(run: Run) -> dict[str, str]:
+    found = _flat(run.config or {})
+    return found | ({"checkpoint": str(run.checkpoint)} if "checkpoint" in found else {})
+
+
+def _flat(value: Any, prefix: str = "") -> dict[str, str]:
     """Nested mappings as dotted names with values as JSON text; text stays as it is, empty mappings have no name."""
     if isinstance(value, Mapping):
-        return {
-            name: text
-            for key, entry in value.items()
-            for name, text in flatten(entry, f"{prefix}.{key}" if prefix else str(key)).items()
-        }
+        nested = (_flat(entry, f"{prefix}.{key}" if prefix else str(key)) for key, entry in value.items())
+        return {name: text for entries in nested for name, text in entries.items()}
     return {prefix: value if isinstance(value, str) else json.dumps(value, default=str)}
+
+
+def _command(path: Path, *flags: str) -> str | None:
+    """The command line of a job or a sweep from a file of Hydra's; None where that is missing or damaged."""
+    try:
+        hydra = safe_load(path.read_text(encoding="utf-8"))["hydra"]
+        script = f"{hydra.get('job', {}).get('name', 'train')}.py"
+        return shlex.join(["python", script, *flags, *map(str, hydra["overrides"]["task"])])
+    except (OSError, ValueError, TypeError, LookupError, AttributeError, YAMLError):
+        return None

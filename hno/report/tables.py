@@ -1,27 +1,20 @@
-"""The tables of a report: columns of `hno.evaluation.sections`, and rows with what they are filtered by."""
+"""The tables of a report, with columns as those of `hno.evaluation.sections`."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from hno.evaluation.format import NOT_AVAILABLE, interval, number, percent, signed, types, whole
+from hno.evaluation.format import NOT_AVAILABLE, interval, number, percent, signed, whole
 from hno.evaluation.outcome import Pooled
 from hno.evaluation.sections import Column, plain, sections
-from hno.report.recipes import Recipe, Spread, TypeCounts, best, pool, seconds
+from hno.report.recipes import Recipe, Spread, best, pool
 from hno.report.records import Run
 from hno.report.verdicts import at, over_seeds
 
-
-class Row(NamedTuple):
-    """Values by the names of columns."""
-
-    values: Mapping[str, Any]
-    names: Mapping[str, str] = {}
-    """What the row is filtered by."""
-    mark: str = ""
-    """ "best", "failed" or "unfinished"; empty for any other row."""
+Row = Mapping[str, Any]
+"""Values by the names of columns; the page also uses "game" and what else it filters by, and "mark"."""
 
 
 class Table(NamedTuple):
@@ -32,7 +25,7 @@ class Table(NamedTuple):
 
     def cells(self, row: Row) -> list[tuple[str, float | None]]:
         """Texts of a row, each with the number that it is sorted by."""
-        values = [(column, row.values.get(column.name)) for column in self.columns]
+        values = [(column, row.get(column.name)) for column in self.columns]
         return [(column.format(value), _order(value)) for column, value in values]
 
     @property
@@ -50,17 +43,10 @@ def _order(value: Any) -> float | None:
     return value if isinstance(value, (int, float)) and not isinstance(value, bool) else None
 
 
-def names_of(entry: Run | Recipe, level: str) -> dict[str, str]:
-    """What an element of the page is filtered by; its level is "recipe", "run" or "any"."""
-    seed = {"seed": plain(entry.seed)} if isinstance(entry, Run) else {}
-    return {"level": level, "game": entry.game, "operator": entry.operator, "activation": entry.activation, **seed}
-
-
-def _worst(found: tuple[Any, float] | None) -> str:
+def _worst(found: tuple[Any, float | None]) -> str:
     """The type with the highest rate: "none" where nothing collided."""
-    if found is None:
-        return NOT_AVAILABLE
-    return "none" if found[0] is None else f"{at(found[0])} {percent(found[1])}"
+    theta, rate = found
+    return f"{at(theta)} {percent(rate)}" if theta else (NOT_AVAILABLE if rate is None else "none")
 
 
 def _rounded(value: float | Spread | None) -> str:
@@ -92,67 +78,55 @@ RECIPE = (
     Column("training", "training", "s", _rounded), Column("total", "total", "s", _rounded),
     Column("unfinished", "open", format=whole), Column("failed", "failed", format=whole),
 )  # fmt: skip
-COST = tuple(one for one in RECIPE if one.name in ("game", "name", "seeds", "labels", "training", "total"))
-"""Seconds of every stage (the paper's cost table)."""
 RUN = (
     Column("name", "run"), Column("status", "status"), Column("game", "game"), Column("operator", "operator"),
     Column("activation", "activation"), Column("seed", "seed"), Column("steps", "steps", format=whole), *COUNTS,
-    Column("worst", "worst type", format=_worst), Column("excess", "excess cost", format=signed),
+    Column("worst", "worst type", format=_worst), Column("relative_excess", "excess cost", format=signed),
     Column("value_error", "value error", format=lambda value: number(value, 4)),
     Column("costate_error", "costate error", format=lambda value: number(value, 4)),
     Column("total", "total", "s", _rounded),
 )  # fmt: skip
-TYPE = (
-    Column("theta", "θ", format=lambda found: found if isinstance(found, str) else at(found)),
-    Column("counts", "collide"),
-    Column("rate", "rate", format=percent),
-    Column("interval", "95 %", format=interval),
-)
+TYPE = (Column("theta", "θ", format=at), Column("labels", "labels"), *COUNTS)
 
 
 def _counts(found: Pooled) -> dict[str, Any]:
-    worst = None if found.worst_rate is None else (found.worst_theta, found.worst_rate)
-    return {**found._asdict(), "worst": worst, "collisions": found.collisions if found.safe_starts else None}
+    some = {"worst": (found.worst_theta, found.worst_rate)} | ({} if found.safe_starts else {"collisions": None})
+    return found._asdict() | some
+
+
+def names_of(entry: Run | Recipe) -> dict[str, Any]:
+    """What an entry of the page is filtered by."""
+    return {
+        key: plain(getattr(entry, key)) for key in ("game", "operator", "activation", "seed") if hasattr(entry, key)
+    }
 
 
 def recipe_table(found: Sequence[Recipe]) -> Table:
     """Every recipe over its seeds; the best of each game is marked."""
-    chosen = best(found).values()
-    rows = []
+    chosen, rows = best(found), list[Row]()
     for one in found:
-        spent = {stage: one.seconds(stage) for stage in ("labels", "training", "total")}
-        counts = {"seeds": len(one.runs), "unfinished": one.unfinished, "failed": one.failed}
-        values = {**_counts(one.pooled), **counts, **spent, "rates": one.rates, "excess": one.excess}
+        known = {name: getattr(one, name) for name in ("name", "unfinished", "failed", "rates", "excess")}
+        known |= {stage: one.seconds(stage) for stage in ("labels", "training", "total")}
         mark = "best" if any(one is other for other in chosen) else ""
-        rows.append(Row({**values, "game": one.game, "name": one.name}, names_of(one, "any"), mark))
+        rows.append({**names_of(one), **_counts(one.pooled), **known, "seeds": len(one.runs), "mark": mark})
     return Table(RECIPE, rows)
 
 
 def run_table(runs: Sequence[Run]) -> Table:
     """Every single run."""
-    return Table(RUN, [Row(_run(run), names_of(run, "any"), _mark(run)) for run in runs])
+    rows = list[Row]()
+    for run in runs:
+        known = {name: getattr(run, name) for name in ("name", "status", "steps")} | {"total": run.spent("total")}
+        errors = {f"{name}_error": run.metrics.get(f"val/{name}_error") for name in ("value", "costate")}
+        mark = "" if run.finished else ("failed" if run.status == "failed" else "unfinished")
+        rows.append({**names_of(run), **_counts(pool(run.table)), **known, **errors, "mark": mark})
+    return Table(RUN, rows)
 
 
-def _mark(run: Run) -> str:
-    return "" if run.finished else ("failed" if run.status == "failed" else "unfinished")
-
-
-def _run(run: Run) -> dict[str, Any]:
-    whole_table = pool(run.table)
-    errors = {f"{name}_error": run.metrics.get(f"val/{name}_error") for name in ("value", "costate")}
-    known = {name: getattr(run, name) for name in ("name", "status", "game", "operator", "activation", "seed", "steps")}
-    return {**_counts(whole_table), **errors, **known, "excess": whole_table.relative_excess,
-            "total": seconds(run, "total")}  # fmt: skip
-
-
-def type_table(found: Iterable[TypeCounts]) -> Table:
-    """Numbers of a heat map."""
-    rows = []
-    for one in found:
-        remarks = [word for word, flag in (("seen", one.seen), ("extrapolated", one.extrapolated)) if flag]
-        theta = " ".join([at(one.theta), *remarks])
-        rows.append(Row({**one._asdict(), "theta": theta, "counts": f"{one.collisions:,} of {one.safe_starts:,}"}))
-    return Table(TYPE, rows)
+def type_table(found: Sequence[dict[str, Any]]) -> Table:
+    """Numbers of a heat map, from rows of `recipes.by_type`."""
+    words = {True: "seen", False: "unseen"}
+    return Table(TYPE, [one | {"labels": words[one["seen"]] + ", extrapolated" * one["extrapolated"]} for one in found])
 
 
 class SectionTable(NamedTuple):
@@ -172,28 +146,27 @@ def section_tables(run: Run) -> list[SectionTable]:
         if content:
             section = sections.get(name)()
             try:
-                table = Table(section.columns, [Row(row) for row in section.rows(content)])
+                table = Table(section.columns, section.rows(content))
+                table.texts  # noqa: B018  # formats fail on foreign values
                 found.append(SectionTable(section.heading, section.note, table, section.remarks(content, entries)))
-                found[-1].table.texts  # noqa: B018  # formats fail on foreign values
-            except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+            except (LookupError, TypeError, ValueError, AttributeError) as error:
                 said = f"cannot be shown: its entry in results.json is damaged ({type(error).__name__}: {error})"
                 found.append(SectionTable(section.heading, "", Table((), ()), [said]))
     return found
 
 
-def mapping_table(entries: Sequence[Mapping[str, Any]]) -> Table:
+def mapping_table(entries: Sequence[Row]) -> Table:
     """Any list of mappings; columns in the order in which they turn up."""
     keys = dict.fromkeys(key for entry in entries for key in entry)
-    columns = [Column(key, key.replace("_", " "), format=_text) for key in keys]
-    return Table(columns, [Row(entry) for entry in entries])
+    return Table([Column(key, key.replace("_", " "), format=_text) for key in keys], entries)
 
 
 def _text(value: Any) -> str:
-    if isinstance(value, (int, float)) and not isinstance(value, bool):
-        return f"{value:,}" if isinstance(value, int) else f"{value:.4g}"
-    if isinstance(value, list) and all(isinstance(entry, (int, float)) for entry in value):
-        return f"({types(value)})"
-    return plain(value) if value is None or isinstance(value, str) else json.dumps(value, sort_keys=True)
+    if isinstance(value, list):
+        return f"({', '.join(map(_text, value))})"
+    if isinstance(value, dict):
+        return ", ".join(f"{count} {name}" for name, count in value.items() if count)
+    return f"{value:.4g}" if isinstance(value, float) else plain(value)
 
 
 def label_tables(runs: Sequence[Run]) -> list[tuple[str, int, Table]]:
@@ -202,15 +175,4 @@ def label_tables(runs: Sequence[Run]) -> list[tuple[str, int, Table]]:
     for run in runs:
         if run.label_statistics:
             shared.setdefault(json.dumps([run.game, run.label_statistics], sort_keys=True), []).append(run)
-    return [
-        (same[0].game, len(same), mapping_table([_label_row(entry) for entry in same[0].label_statistics]))
-        for same in shared.values()
-    ]
-
-
-def _label_row(entry: Mapping[str, Any]) -> dict[str, Any]:
-    """An entry with its counts by status, as far as they are not 0, as columns of their own."""
-    status = entry.get("status")
-    counts = {name: count for name, count in status.items() if count} if isinstance(status, dict) else {}
-    rest = {key: value for key, value in entry.items() if key != "status"}
-    return {"theta": rest.pop("theta", None), "starts": rest.pop("starts", None), **counts, **rest}
+    return [(same[0].game, len(same), mapping_table(same[0].label_statistics)) for same in shared.values()]

@@ -34,7 +34,7 @@ def compiled(chart: alt.TopLevelMixin) -> dict[str, Any]:
 def svg(chart: alt.TopLevelMixin) -> str:
     """A chart with data as SVG, in light colours."""
     specification = chart.to_dict()
-    specification["config"] = {**chart_config(LIGHT), "background": "white", "aria": False}
+    specification["config"] = {**chart_config("light"), "background": "white", "aria": False}
     return vl_convert.vegalite_to_svg(specification, vl_version=version())
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from hno.evaluation.format import NOT_AVAILABLE, counted, interval, percent, signed, types
 from hno.evaluation.outcome import Pooled
 from hno.report.episode import Episode
-from hno.report.recipes import Recipe, Spread, best, rivals
+from hno.report.recipes import Recipe, Spread, rivals
 from hno.report.records import Run
 from hno.report.runs import Sweep
 
@@ -15,14 +15,6 @@ from hno.report.runs import Sweep
 def share(found: Pooled) -> str:
     """Collisions of starts, in short."""
     return f"{found.collisions:,} of {found.safe_starts:,}: {percent(found.rate)}"
-
-
-def rate(found: Pooled) -> str:
-    """Collisions of starts, with everything needed to judge them."""
-    if not found.safe_starts:
-        return f"no safe start, collision rate {NOT_AVAILABLE}"
-    counts = f"{counted(found.collisions, 'collision')} in {counted(found.safe_starts, 'safe start')}"
-    return f"{counts} ({percent(found.rate)}, 95 % interval {interval(found.interval)})"
 
 
 def at(theta: Sequence[float]) -> str:
@@ -58,8 +50,7 @@ def jobs(sweep: Sweep) -> str:
     """How many jobs ended how."""
     finished = sum(run.finished for run in sweep.runs)
     failed = sum(run.status == "failed" for run in sweep.runs)
-    waiting = (sweep.planned or 0) - len(sweep.runs) - len(sweep.skipped)
-    counts = {"failed": failed, "unfinished": len(sweep.runs) - finished - failed, "not begun": waiting}
+    counts = {"failed": failed, "unfinished": len(sweep.runs) - finished - failed}
     said = [f"{finished} finished", *(f"{count} {state}" for state, count in counts.items() if count > 0)]
     said += [f"{counted(len(sweep.skipped), 'folder')} skipped"] if sweep.skipped else []
     return f"{counted(len(sweep.runs), 'run')}: {', '.join(said)}."
@@ -72,30 +63,19 @@ def quality(found: Pooled) -> str:
     return "safe" if found.collisions == 0 else ("rare" if found.rate <= 0.01 else "unsafe")
 
 
-def verdicts(recipes: Sequence[Recipe]) -> list[tuple[Recipe, str]]:
-    """The best recipes with a judgement, for every game and conditions of play."""
-    chosen = sorted(best(recipes).values(), key=lambda recipe: recipe.game)
-    return [(recipe, _verdict(recipe, recipes)) for recipe in chosen]
-
-
-def _verdict(recipe: Recipe, recipes: Sequence[Recipe]) -> str:
+def verdict(recipe: Recipe, recipes: Sequence[Recipe]) -> str:
+    """A judgement of a recipe in which something was played, and the others that it is not told apart from."""
     whole = recipe.pooled
     judged = {"safe": "No start collides", "rare": "Collisions are rare", "unsafe": "Not safe"}[quality(whole)]
-    worst = ""
-    if whole.worst_theta is not None:
-        (counts,) = (one for one in recipe.types if one.theta == whole.worst_theta)
-        worst = f" Worst type {at(counts.theta)}: {counts.collisions} of {counts.safe_starts:,}."
+    worst = next((one for one in recipe.types if one["theta"] == whole.worst_theta), None)
+    told = f" Worst type {at(worst['theta'])}: {worst['collisions']} of {worst['safe_starts']:,}." if worst else ""
     others = [other.name for other in rivals(recipe, recipes)]
-    rest = f" Not told apart from {_list(others)}: the intervals overlap." if others else ""
+    names = ", ".join(others[:3]) + (f" and {len(others) - 3} more" if len(others) > 3 else "")
+    rest = f" Not told apart from {names}: the intervals overlap." if others else ""
     return (
-        f"{judged} ({seeds(recipe)}, {recipe.conditions}): 95 % interval {interval(whole.interval)}.{worst} "
+        f"{judged} ({seeds(recipe)}, {recipe.conditions}): 95 % interval {interval(whole.interval)}.{told} "
         f"Joint cost above the equilibrium's: {over_seeds(recipe.excess)}.{rest}"
     )
-
-
-def _list(names: Sequence[str], shown: int = 3) -> str:
-    more = f" and {len(names) - shown} more" if len(names) > shown else ""
-    return ", ".join(names[:shown]) + more
 
 
 def why(run: Run) -> str:

@@ -10,10 +10,12 @@ from pathlib import Path
 from typing import Any, final
 
 import torch
+from torch import Tensor
 
 from hno.control.policy import Feedback
 from hno.games import Game, games, make
 from hno.operators import Architecture, Choice, ValueOperator, make_operator
+from hno.pontryagin.threads import torch_threads
 
 KEY = "hno"
 """Checkpoint entry that says how to build the operator and where it comes from."""
@@ -135,11 +137,21 @@ def load_operator(path: str | Path, game: str | None = None) -> tuple[ValueOpera
 
 @final
 class LearnedPolicy(Feedback):
-    """The policy of a trained operator, with what it is built of and where it comes from."""
+    """The policy of a trained operator, with what it is built of and where it comes from.
 
-    def __init__(self, operator: ValueOperator, architecture: Architecture, provenance: Provenance) -> None:
+    Every answer takes so many `threads` of torch; one answer is too small for several.
+    """
+
+    def __init__(
+        self, operator: ValueOperator, architecture: Architecture, provenance: Provenance, threads: int = 1
+    ) -> None:
         super().__init__(operator)
-        self.architecture, self.provenance = architecture, provenance
+        self.architecture, self.provenance, self.threads = architecture, provenance, threads
+
+    def act(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
+        """As `Feedback.act`, on `threads` threads."""
+        with torch_threads(self.threads):
+            return super().act(tau, x, theta)
 
     @property
     def types(self) -> list[tuple[float, ...]]:
@@ -152,6 +164,6 @@ class LearnedPolicy(Feedback):
         return {"game": game, "operator": self.provenance.method, "activation": self.architecture.activation.name}
 
 
-def load_policy(path: str | Path, game: str | None = None) -> LearnedPolicy:
-    """The policy of the operator in a checkpoint. Arguments and errors as of `load_operator`."""
-    return LearnedPolicy(*load_operator(path, game))
+def load_policy(path: str | Path, game: str | None = None, threads: int = 1) -> LearnedPolicy:
+    """The policy of the operator in a checkpoint. Arguments and errors as of `load_operator` and `LearnedPolicy`."""
+    return LearnedPolicy(*load_operator(path, game), threads)

@@ -15,7 +15,7 @@ from hno.data import GameData
 from hno.data.certificates import safe
 from hno.evaluation import closed_loop
 from hno.training.module import TrainingModule
-from hno.training.validation import ClosedLoopValidation, Score
+from hno.training.validation import ClosedLoopValidation, Later, Score
 from hno.types import Batch, Extremal, Trajectory
 from tests.cli.conftest import SMOKE, Command, Outcome, refused
 from tests.cli.test_train import equal, power_cut, weights
@@ -67,9 +67,9 @@ def test_validation_plays_the_safe_held_out_starts(
     held: list[list[Extremal]] = []
     begin, setup = ClosedLoopValidation.begin, GameData.setup
 
-    def watched(self: ClosedLoopValidation, labels: list[Extremal]) -> None:
+    def watched(self: ClosedLoopValidation, labels: list[Extremal], later: Later | None) -> None:
         given.append(labels)
-        begin(self, labels)
+        begin(self, labels, later)
 
     def prepared(self: GameData, stage: str) -> None:
         setup(self, stage)
@@ -93,9 +93,9 @@ def test_validation_starts_of_chosen_types(command: Command, monkeypatch: pytest
     given: list[list[Extremal]] = []
     begin = ClosedLoopValidation.begin
 
-    def watched(self: ClosedLoopValidation, labels: list[Extremal]) -> None:
+    def watched(self: ClosedLoopValidation, labels: list[Extremal], later: Later | None) -> None:
         given.append(labels)
-        begin(self, labels)
+        begin(self, labels, later)
 
     monkeypatch.setattr(ClosedLoopValidation, "begin", watched)
     run = command("train", *SMOKE, "trainer.max_steps=2", "validation.types='1,1;2,3'", "validation.starts=2")
@@ -118,7 +118,7 @@ def test_validation_starts_of_chosen_types(command: Command, monkeypatch: pytest
         (("validation.types='1,1;2'",), "2 finite numbers, one per player; got [2.0]"),
         (("validation.types='1,nan'",), "2 finite numbers"),
         (("validation.types='1,inf'",), "2 finite numbers"),
-        (("validation.types=''",), "validation.types must be one of"),
+        (("validation.types=''",), "validation.types must name player types"),
         (("validation.types=5",), "2 finite numbers, one per player; got [5.0]"),
         (("validation.types=[[1,1,1]]",), "2 finite numbers, one per player; got [1, 1, 1]"),
         (
@@ -132,9 +132,9 @@ def test_validation_starts_of_chosen_types(command: Command, monkeypatch: pytest
         (("validation=grid5", "validation.starts=many"), "validation.starts must be a whole number of at least 1"),
         (("validation=grid7",), "Did you mean 'grid5'?"),
         (("validation.stop=true",), "Known: seed, starts, stop_when_safe, types"),
-        (("loss.hardest=0",), "loss.hardest is a share in (0, 1]; got 0"),
-        (("loss.hardest=1.5",), "loss.hardest is a share in (0, 1]; got 1.5"),
-        (("sampler.rollout=-1",), "Shares of the sampler's sources must be finite, not negative"),
+        (("loss.hardest=0",), "loss.hardest must be a share in (0, 1]; got 0"),
+        (("loss.hardest=1.5",), "loss.hardest must be a share in (0, 1]; got 1.5"),
+        (("sampler.rollout=-1",), "sampler.rollout must have a share, a finite number of at least 0; got"),
         (("sampler=roll-out",), "Did you mean 'rollout'?"),
         (("optimizer=moun",), "Did you mean 'muon'?"),
         (("optimizer.schedule=liner",), "Did you mean 'linear'?"),

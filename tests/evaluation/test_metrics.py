@@ -82,3 +82,9 @@ def test_binned_means_are_means_of_bins() -> None:
     expected = [MEASURED[place == PLACE].abs().double().mean() for place in range(4)]
     torch.testing.assert_close(found[:4], torch.stack(expected))
     assert math.isnan(float(found[4]))
+
+
+def test_saturation_is_of_each_players_own_box() -> None:
+    box = Box([[-1.0], [-5.0]], [[1.0], [5.0]])
+    u = torch.tensor([[[[1.0], [1.0]], [[0.0], [-5.0]]]])
+    assert saturated_share(u, box) == 0.5

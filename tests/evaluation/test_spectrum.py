@@ -1,12 +1,13 @@
 from __future__ import annotations
 
 import json
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
-from hno.evaluation.spectrum import Ratio, condition_ratio, spectrum, summary
+from hno.evaluation.spectrum import Ratio, condition_ratio, condition_ratios, spectrum, summary
 
 
 def matrix(*eigenvalues: float) -> Tensor:
@@ -66,15 +67,54 @@ def test_summary_keeps_the_ends_of_the_curve() -> None:
     assert len(numbers) <= 40
 
 
-def test_a_ratio_of_whole_matrices_is_that_of_their_condition_numbers() -> None:
-    tanh, relu = summary(spectrum(matrix(6.0, 3.0))), summary(spectrum(matrix(40.0, 1.0)))
-    assert condition_ratio(tanh, relu) == Ratio(pytest.approx(2 / 40), "=")
+def entry(theta: tuple[float, float], *eigenvalues: float, points: int = 2) -> dict[str, Any]:
+    """An entry of a section "ntk", whose product has the squares of the kernel's eigenvalues."""
+    squares = (value**2 for value in eigenvalues)
+    spectra = {"kernel": summary(spectrum(matrix(*eigenvalues))), "product": summary(spectrum(matrix(*squares)))}
+    return {"theta": list(theta), "points": points, **spectra}
+
+
+def test_ratios_of_the_paper() -> None:
+    corner, other = (1.0, 5.0), (5.0, 5.0)
+    results = {
+        "sin": [entry(other, 1.0, 1.0), entry(corner, 8.0, 2.0)],
+        "tanh": [entry(corner, 6.0, 3.0), entry(other, 9.0, 3.0)],
+        "relu": [entry(corner, 40.0, 1.0), entry(other, 1.0, 0.5), entry((3.0, 3.0), 1.0, 1.0)],
+    }
+    found = condition_ratios(results)
+    assert [row["theta"] for row in found] == [[1.0, 5.0], [5.0, 5.0]]
+    values = [(row[kind][name].value) for row in found for kind in ("kernel", "product") for name in ("sin", "relu")]
+    assert values == pytest.approx([2 / 4, 2 / 40, 4 / 16, 4 / 1600, 3, 3 / 2, 9, 9 / 4])
+    assert {row[kind][name].bound for row in found for kind in ("kernel", "product") for name in ("sin", "relu")} == {
+        "="
+    }
 
 
 def test_a_ratio_with_a_matrix_that_is_cut_off_is_a_bound() -> None:
-    whole, cut = summary(spectrum(matrix(4.0, 2.0))), summary(spectrum(matrix(4.0, 0.0)))
+    whole, cut = entry((1.0, 1.0), 4.0, 2.0)["kernel"], entry((1.0, 1.0), 4.0, 0.0)["kernel"]
     nothing, limit = summary(spectrum(matrix(0.0, 0.0))), 1 / (2 * 2.0**-52)
     assert condition_ratio(cut, whole) == Ratio(pytest.approx(limit / 2), ">")
     assert condition_ratio(whole, cut) == Ratio(pytest.approx(2 / limit), "<")
     for pair in ((cut, cut), (nothing, whole), (whole, nothing)):
         assert condition_ratio(*pair) == Ratio(None, "n/a")
+
+
+def test_ratios_that_cannot_be_formed() -> None:
+    section = [entry((1.0, 1.0), 2.0, 1.0)]
+    with pytest.raises(ValueError, match="'tanh' and at least one other; got sin, relu"):
+        condition_ratios({"sin": section, "relu": section})
+    with pytest.raises(ValueError, match="at least one other"):
+        condition_ratios({"tanh": section})
+    with pytest.raises(ValueError, match="no player type in common"):
+        condition_ratios({"tanh": section, "sin": [entry((1.0, 5.0), 2.0, 1.0)]})
+    with pytest.raises(ValueError, match="no player type in common"):
+        condition_ratios({"tanh": section, "sin": [{"theta": [1.0, 1.0], "points": 0, "kernel": None}]})
+    with pytest.raises(ValueError, match="numbers of points"):
+        condition_ratios({"tanh": section, "sin": [entry((1.0, 1.0), 2.0, 1.0, points=3)]})
+
+
+def test_a_network_without_a_product_has_a_ratio_of_kernels_alone() -> None:
+    section, other = [entry((1.0, 1.0), 2.0, 1.0)], [entry((1.0, 1.0), 8.0, 1.0) | {"product": None}]
+    (row,) = condition_ratios({"tanh": section, "sin": other})
+    assert row["kernel"]["sin"] == Ratio(pytest.approx(1 / 4), "=")
+    assert row["product"]["sin"] == Ratio(None, "n/a")

@@ -16,10 +16,14 @@ from hno.operators import Architecture, Choice, ValueOperator, make_operator, ne
 from hno.training import Fitted, Settings, fit
 from hno.training.module import TrainingModule
 from hno.training.optimizers import optimizers
+from tests.cli.conftest import clean_globals, command, no_pages
+
+__all__ = ["clean_globals", "command", "no_pages"]
 
 FOLDER = Path(__file__).parents[2] / "examples"
 LABELS = {"value": {}, "costate": {}}
 """The terms that compare with labels."""
+SMALL = Choice("deeponet", {"width": 32, "depth": 3})
 
 
 SMALL = Choice("deeponet", {"width": 32, "depth": 3})

@@ -3,7 +3,7 @@ from __future__ import annotations
 import torch
 from hno_examples.car_and_cyclist import CarAndCyclist
 
-from hno.control import rollout
+import hno
 from hno.control.policy import Feedback
 from hno.games.testing import check_game
 from tests.examples.conftest import Train
@@ -27,7 +27,7 @@ def test_trains_and_plays_within_the_limits(train: Train):
     trained = train(game, [(1, 1), (5, 1)])
     assert trained.after < 0.7 * trained.before
     x0 = game.initial_box.sample(8, torch.Generator().manual_seed(1))
-    played = rollout(game, Feedback(trained.operator), x0, torch.ones(8, 2), dt=0.1)
+    played = hno.rollout(game, Feedback(trained.operator), x0, torch.ones(8, 2), dt=0.1)
     assert (game.control_box.lo - 1e-6 <= played.u).all()
     assert (played.u <= game.control_box.hi + 1e-6).all()
     ends = played.x[:, -1]

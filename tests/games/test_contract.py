@@ -323,3 +323,22 @@ def test_a_game_with_declared_roles_may_treat_players_differently():
     game = DifferentTargets()
     game.roles = (0, 1)
     check_game(game)
+
+
+class Pursuit(Encounter):
+    roles = (0, 1)
+
+    def terminal_value(self, x: Tensor) -> Tensor:
+        apart = x[..., :2].diff(dim=-2).square().sum((-2, -1))
+        return torch.stack([-apart, apart], -1)
+
+
+def test_opposed_interests_are_pointed_out():
+    with pytest.warns(UserWarning, match=r"Players \[0, 1\] have opposed interests"):
+        check_game(Pursuit())
+
+
+def test_shared_interests_are_not(recwarn):
+    check_game(random_game(3))
+    check_game(Encounter())
+    assert not recwarn.list

@@ -10,6 +10,7 @@ from hno.games import Box, make
 from hno.games.base import own_costate
 from hno.pontryagin import Solver, solve
 from hno.types import Extremal, Status, join
+from tests.games.test_contract import FreeEncounter
 from tests.lq import LinearQuadratic, open_loop_nash, open_loop_riccati, random_game
 from tests.pontryagin.encounters import starts, types
 
@@ -97,6 +98,13 @@ def test_rows_do_not_influence_each_other():
     for found in (alone, chunked):
         torch.testing.assert_close(found.x, together.x, rtol=0, atol=1e-7)
         torch.testing.assert_close(found.value, together.value, rtol=0, atol=1e-6)
+
+
+def test_states_and_controls_come_in_one_batch_shape():
+    """These dynamics concatenate them, which does not broadcast."""
+    game = FreeEncounter()
+    x0 = torch.tensor([[[-1.0, 0.1, 0, 0], [1, 0, 0, 0]]], dtype=torch.float64)
+    assert solve(game, x0, types(1, 1, 1)).status.tolist() == [Status.CONVERGED]
 
 
 def test_the_game_itself_is_left_alone():

@@ -113,9 +113,8 @@ def write_run(
     (folder / ".hydra").mkdir(parents=True, exist_ok=True)
     (folder / "results.json").write_text(json.dumps(results))
     choices = {key: results.get(key) for key in ("game", "operator", "activation", "seed")}
-    overrides = "".join(f"- {json.dumps(f'{key}={value}')}\n" for key, value in choices.items())
-    (folder / ".hydra" / "overrides.yaml").write_text(overrides)
-    (folder / ".hydra" / "hydra.yaml").write_text("hydra:\n  job:\n    name: train\n")
+    hydra = {"job": {"name": "train"}, "overrides": {"task": [f"{key}={value}" for key, value in choices.items()]}}
+    (folder / ".hydra" / "hydra.yaml").write_text(json.dumps({"hydra": hydra}))
     if not extras:
         return folder
     rng = np.random.default_rng(list(folder.name.encode()))

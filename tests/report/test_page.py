@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hno.report import episodes, page_data
-from hno.report.episode import episode
-from hno.report.page import embedded, render, write_page
+from hno.report import page_data
+from hno.report.episode import closest, episode, frames
+from hno.report.page import EPISODES, embedded, render, write_page
 from hno.report.recipes import recipes
 from hno.report.runs import load
 from tests.report.folders import GRID5, GRID9, make_episode, make_results, row, write_run, write_sweep
@@ -72,7 +72,6 @@ def test_every_job_is_accounted_for(small_page):
     text = html.unescape(small_page)
     assert "20 runs: 18 finished, 1 failed, 1 unfinished" in text
     assert "DivergedError: the loss is not finite at step 350." in text
-    assert "16 not begun" in text
 
 
 def test_the_excess_cost_is_explained_as_it_is_taken(small_page):
@@ -134,7 +133,7 @@ def test_two_hundred_runs_say_which_episodes_are_left_out(big):
     page = Page(text)
     total = sum(len(run.episodes) for run in sweep.runs)
     shown = len(page.data["episodes"])
-    assert shown == episodes.MOST < total
+    assert shown == EPISODES < total
     assert f"{shown:,} of {total:,} episodes are in this page" in text
     told = {entry["title"].split(" · ")[0] for entry in page.data["episodes"] if " · worst" in entry["title"]}
     assert told == {run.name for run in sweep.runs if run.episodes}
@@ -143,7 +142,7 @@ def test_two_hundred_runs_say_which_episodes_are_left_out(big):
 def test_a_large_type_grid_has_all_its_cells(tmp_path):
     for seed in range(3):
         write_run(tmp_path / str(seed), make_results("drone", "sno", "tanh", seed, np.random.default_rng(seed), GRID9))
-    assert len(Page(render(load(tmp_path))).data["maps"]["r0"]) == 81
+    assert len(Page(render(load(tmp_path))).data["maps"]["map0"]) == 81
 
 
 def test_one_run_is_enough(tmp_path):
@@ -165,7 +164,7 @@ def test_no_safe_start_is_no_zero(tmp_path):
     write_run(tmp_path, results, extras=False)
     text = render(load(tmp_path))
     assert "the collision rate is n/a" in text
-    (cell,) = Page(text).data["maps"]["r0"]
+    (cell,) = Page(text).data["maps"]["map0"]
     assert (cell["safe_starts"], cell["rate"], cell["interval"], cell["relative_excess"]) == (0, None, None, None)
 
 
@@ -195,13 +194,13 @@ def test_a_page_is_written_whole_or_not_at_all(small_sweep, tmp_path, monkeypatc
 
 def test_the_player_gets_what_the_file_holds():
     found = episode(make_episode("drone", (1.0, 5.0), "worst", -0.1))
-    frames = episodes.frames(found)
+    rows = frames(found)
     for axis, name in enumerate("xyz"):
-        assert np.abs([frame[name] for frame in frames] - found.positions[..., axis]).max() <= 0.0051
-        assert np.abs([frame[f"label_{name}"] for frame in frames] - found.label_positions[..., axis]).max() <= 0.0051
-    gaps = [frame["distance"] - frame["radius"] for frame in frames]
+        assert np.abs([frame[name] for frame in rows] - found.positions[..., axis]).max() <= 0.00051
+        assert np.abs([frame[f"label_{name}"] for frame in rows] - found.label_positions[..., axis]).max() <= 0.00051
+    gaps = [frame["distance"] - frame["radius"] for frame in rows]
     assert min(gaps) == pytest.approx(-0.1, abs=2e-3)
-    assert gaps.index(min(gaps)) == episodes.closest(found)
+    assert gaps.index(min(gaps)) == closest(found)
 
 
 @pytest.mark.parametrize(("players", "radius"), [(1, None), (2, None), (3, 1.0)])

@@ -24,10 +24,9 @@ def drawn(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, table: list[dict[str,
     return ET.fromstring(kept[0])
 
 
-def test_every_cell_says_its_rate_and_its_number_of_starts(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_every_cell_says_its_rate_and_the_title_the_counts(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     texts = [text for text in drawn(monkeypatch, tmp_path, TABLE).itertext() if text.strip()]
-    assert {"0", "5.0", "n/a", "of 0", "a game"} <= set(texts)
-    assert texts.count("of 200") == 2
+    assert {"0", "5.0", "n/a", "a game", "10 of 400: 2.50 %", "0 to 200 safe starts per type"} <= set(texts)
 
 
 def rectangles(found: ET.Element) -> list[dict[str, str]]:
@@ -66,7 +65,7 @@ def test_a_rollout_has_a_view_for_every_plane_and_the_distance(
 
 def test_a_view_shows_paths_up_to_its_frame_and_discs_that_turn_red() -> None:
     found = read(episode((1, 5), -0.3, frames=5))
-    shown = [vega.svg(pictures.view(found, "y", frame, follow=False)) for frame in (0, 4)]
+    shown = [vega.svg(pictures.views(found, frame, False, "")["top"]) for frame in (0, 4)]
     paths = [
         max(len(path.get("d", "").split("L")) for path in ET.fromstring(text).iter() if path.tag.endswith("path"))
         for text in shown

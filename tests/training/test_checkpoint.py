@@ -300,3 +300,13 @@ def test_fingerprint_tells_sensors_apart() -> None:
     changed = make("narrow_road")
     changed.first_sensor = 0.5
     assert changed.fingerprint() != make("narrow_road").fingerprint()
+
+
+def test_an_answer_takes_one_thread_unless_told_otherwise(save: Save, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = []
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 7)
+    monkeypatch.setattr(torch, "set_num_threads", seen.append)
+    points = random_points(make("narrow_road"))
+    for threads in (1, 2):
+        hno.load_policy(save(), threads=threads)(*points)
+    assert seen == [1, 7, 2, 7]

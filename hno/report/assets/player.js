@@ -29,9 +29,9 @@ function scene({ frames }, name, whole, solid) {
   return draw($(name), name, { frames }, { width, height, frame: player.frame, follow: $("follow").checked, ...whole });
 }
 
-function apart({ frames, reach }) {
+function apart({ frames }) {
   $("apart").hidden = frames[0].distance === null;
-  return $("apart").hidden ? null : draw($("apart"), "separation", { frames }, { frame: player.frame, reach });
+  return $("apart").hidden ? null : draw($("apart"), "separation", { frames }, { frame: player.frame });
 }
 
 function seek(frame) {
