@@ -75,15 +75,18 @@ def summary(found: Spectrum) -> dict[str, Any]:
     return {"rows": len(found.eigenvalues), **plain, "curve": curve}
 
 
-def condition_ratio(over: Summary, under: Summary) -> Ratio:
+def condition_ratio(over: Summary | None, under: Summary | None) -> Ratio:
     """Condition number of one matrix over that of another; a bound where one of them is cut off."""
-    whole = tuple(found["rank"] == found["rows"] for found in (over, under))
-    if 0 in (over["rank"], under["rank"]) or not any(whole):
+    if over is None or under is None or not (over["rank"] and under["rank"]):
+        return Ratio(None, "n/a")
+    whole = over["rank"] == over["rows"], under["rank"] == under["rows"]
+    bound = {(True, True): "=", (False, True): ">", (True, False): "<"}.get(whole)
+    if bound is None:
         return Ratio(None, "n/a")
     large, small = (
-        found["condition"] if known else 1 / found["cutoff"] for found, known in zip((over, under), whole, strict=True)
+        one["condition"] if known else 1 / one["cutoff"] for one, known in zip((over, under), whole, strict=True)
     )
-    return Ratio(large / small, {(True, True): "=", (False, True): ">", (True, False): "<"}[whole])
+    return Ratio(large / small, bound)
 
 
 def condition_ratios(results: Mapping[str, Sequence[Mapping[str, Any]]], over: str = "tanh") -> list[dict[str, Any]]:
@@ -117,8 +120,7 @@ def _ratios(theta: tuple[float, ...], entries: Mapping[str, Mapping[str, Any]], 
         raise ValueError(
             f"Kernels of different numbers of points do not compare; at theta = {theta} these are {points}."
         )
-    numerator, others = entries[over], [name for name in entries if name != over]
     return {"theta": list(theta)} | {
-        kind: {name: condition_ratio(numerator[kind], entries[name][kind]) for name in others}
+        kind: {name: condition_ratio(entries[over][kind], one[kind]) for name, one in entries.items() if name != over}
         for kind in ("kernel", "product")
     }

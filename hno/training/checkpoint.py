@@ -139,11 +139,7 @@ def load_operator(path: str | Path, game: str | None = None) -> tuple[ValueOpera
 class LearnedPolicy(Feedback):
     """The policy of a trained operator, and where it comes from.
 
-    Args:
-        operator: the operator.
-        architecture: what it is built of.
-        provenance: where it comes from.
-        threads: of torch for each answer; one answer is too small for several.
+    Every answer takes so many `threads` of torch; one answer is too small for several.
     """
 
     def __init__(

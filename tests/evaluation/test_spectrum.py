@@ -111,3 +111,10 @@ def test_ratios_that_cannot_be_formed() -> None:
         condition_ratios({"tanh": section, "sin": [{"theta": [1.0, 1.0], "points": 0, "kernel": None}]})
     with pytest.raises(ValueError, match="numbers of points"):
         condition_ratios({"tanh": section, "sin": [entry((1.0, 1.0), 2.0, 1.0, points=3)]})
+
+
+def test_a_network_without_a_product_has_a_ratio_of_kernels_alone() -> None:
+    section, other = [entry((1.0, 1.0), 2.0, 1.0)], [entry((1.0, 1.0), 8.0, 1.0) | {"product": None}]
+    (row,) = condition_ratios({"tanh": section, "sin": other})
+    assert row["kernel"]["sin"] == Ratio(pytest.approx(1 / 4), "=")
+    assert row["product"]["sin"] == Ratio(None, "n/a")
