@@ -48,7 +48,13 @@ def train(
     place = Path(folder)
     place.mkdir(parents=True, exist_ok=True)
     warnings.filterwarnings("ignore", message=".*exists and is not empty")  # results.json is there first
-    fitted = train_operator(checked, place, Results(place / "results.json", {"game": name, "operator": method}))
+    results = Results(place / "results.json", {"game": name, "operator": method, "seed": checked.seed})
+    try:
+        fitted = train_operator(checked, place, results)
+    except BaseException as error:
+        results.update(status="failed", reason=f"{type(error).__name__}: {error}")
+        raise
+    results.update(status="finished")
     return load_policy(fitted.checkpoint)
 
 

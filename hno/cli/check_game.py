@@ -25,8 +25,9 @@ def run(given: Arguments) -> int:
     try:
         game = _game(name, constants)
         check_game(game)
-    except (ContractError, LookupError, ValueError, ImportError, TypeError) as error:
-        print(f"{name} cannot be used yet: {error}", file=sys.stderr)
+    except Exception as error:  # whatever a file of the user's raises
+        kind = "" if isinstance(error, (ContractError, LookupError)) else f"{type(error).__name__}: "
+        print(f"{name} cannot be used yet: {kind}{error}", file=sys.stderr)
         return 1
     print(
         f"{name} keeps the contract of a game: {game.players} players, {game.state_dim} states and "

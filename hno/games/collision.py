@@ -29,6 +29,15 @@ class CollisionAvoidance(ControlAffineGame):
     sensor_spacing: float = 0.05
     """Distance between sensors, m."""
 
+    def __init_subclass__(cls, **options: object) -> None:
+        """Refuse games of one player, which have nobody to keep distance from."""
+        super().__init_subclass__(**options)
+        if len(cls.roles) < 2:
+            raise TypeError(
+                f"{cls.__name__} has one player, and CollisionAvoidance is for two or more: derive it from "
+                "ControlAffineGame and state its constraint."
+            )
+
     @abc.abstractmethod
     def positions(self, x: Tensor) -> Tensor:
         """Where the players are in one common frame, m, (B, P, n) -> (B, P, 2 or 3)."""

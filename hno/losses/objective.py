@@ -72,7 +72,8 @@ class Objective(nn.Module):
         if set(terms) != set(weights):
             raise ValueError(
                 f"Every loss term needs a weight and every weight a term; got the terms {', '.join(sorted(terms))} and "
-                f"weights of {', '.join(sorted(weights))}."
+                f"weights of {', '.join(sorted(weights))}. Without their counterpart: "
+                f"{', '.join(sorted(set(terms) ^ set(weights)))}."
             )
         self.weights = {name: float(weights[name]) for name in terms}
         if not all(math.isfinite(w) and w >= 0 for w in self.weights.values()) or not any(self.weights.values()):

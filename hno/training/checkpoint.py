@@ -51,11 +51,16 @@ def record(game: Game, architecture: Architecture, provenance: Provenance) -> di
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Any]:
-    """The content of a checkpoint; only tensors and plain containers are unpickled.
+    """The content of a checkpoint, or of the best or last one in a run's folder.
+
+    Only tensors and plain containers are unpickled.
 
     Raises:
         CheckpointError: no such file, truncated, or not written by this version of the package.
     """
+    inside = [Path(path) / name for name in ("best.ckpt", "last.ckpt")]
+    if Path(path).is_dir():
+        path = next((file for file in inside if file.exists()), inside[0])
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError as error:
@@ -152,6 +157,16 @@ class LearnedPolicy(Feedback):
         """As `Feedback.act`, on `threads` threads."""
         with torch_threads(self.threads):
             return super().act(tau, x, theta)
+
+    def value(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
+        """As `Feedback.value`, on `threads` threads."""
+        with torch_threads(self.threads):
+            return super().value(tau, x, theta)
+
+    def costate(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
+        """As `Feedback.costate`, on `threads` threads."""
+        with torch_threads(self.threads):
+            return super().costate(tau, x, theta)
 
     @property
     def types(self) -> list[tuple[float, ...]]:

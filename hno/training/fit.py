@@ -126,7 +126,7 @@ def fit(
     metrics = {name: loss for name, loss in logged.items() if not math.isnan(loss)}
     if data.val_rows is not None:
         metrics |= trainer.validate(module, datamodule=data, verbose=False)[0]
-    checkpoint = folder / (BEST if (folder / BEST).exists() else LAST)
+    checkpoint = folder / (LAST if watch.best is None else BEST)  # a best one of another run does not count
     return Fitted(trainer, checkpoint, metrics, watch.best, seconds)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -22,6 +23,7 @@ def test_training_and_evaluation_as_calls(tmp_path: Path) -> None:
     tau, theta = torch.tensor([3.0]), torch.ones(1, 2)
     x = policy.game.initial_box.sample(1, torch.Generator().manual_seed(0))
     assert policy.value(tau, x, theta).shape == (1, 2)
+    assert json.loads((tmp_path / "run" / "results.json").read_text())["status"] == "finished"
     settings = {"theta": "1,1", "starts": 4, "workers": 1, "dt": 0.1, "residuals": False}
     found = hno.evaluate(tmp_path / "run", settings=settings)
     assert found["status"] == "finished"
@@ -34,3 +36,5 @@ def test_a_game_keeps_its_constants_and_mistakes_are_errors(tmp_path: Path) -> N
         hno.train(make("narrow_road", radius=1.5), "hno", tmp_path, {**TINY, "trainer.max_step": 3})
     with pytest.raises(AssertionError, match="labels were asked for"):
         hno.train(make("narrow_road", radius=1.5), "hno", tmp_path, TINY)
+    found = json.loads((tmp_path / "results.json").read_text())
+    assert (found["status"], found["reason"]) == ("failed", "AssertionError: labels were asked for")

@@ -75,3 +75,12 @@ def test_a_broken_game_is_refused_in_plain_words(capsys: Printed, monkeypatch: p
     printed = capsys.readouterr().err
     assert "slow cannot be used yet: Expected a horizon that is a whole multiple of label_step" in printed
     assert "Traceback" not in printed
+
+
+def test_a_file_that_cannot_be_read_is_one_sentence(tmp_path, capsys, monkeypatch):
+    (tmp_path / "unfinished.py").write_text("class Unfinished(")
+    monkeypatch.chdir(tmp_path)
+    assert main(["check-game", "unfinished:Unfinished"]) == 1
+    said = capsys.readouterr().err
+    assert "cannot be used yet: SyntaxError" in said
+    assert "Traceback" not in said

@@ -40,7 +40,7 @@ def test_nothing_is_overwritten(tmp_path: Path, capsys: Printed) -> None:
     (tmp_path / "hno_corridor" / "__init__.py").unlink()
     capsys.readouterr()
     assert main(["new-game", "corridor", "--to", str(tmp_path)]) == 1
-    assert f"Nothing was written: {file}" in capsys.readouterr().err
+    assert f"Nothing was written: there already: {file}" in capsys.readouterr().err
     assert file.read_text() == "mine"
     assert not (tmp_path / "hno_corridor" / "__init__.py").exists()
 
@@ -52,7 +52,9 @@ def test_nothing_is_overwritten(tmp_path: Path, capsys: Printed) -> None:
         (("two", "words"), "Name the game"),
         (("Big",), "small letters"),
         (("a-b",), "small letters"),
-        (("class",), "small letters"),
+        (("class",), "means something else"),
+        (("none",), "means something else"),
+        (("box",), "means something else"),
         (("drone",), "There is a game 'drone' already"),
     ],
 )

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from hno.games import Box, ControlAffineGame, Game, make
+from hno.games import Box, CollisionAvoidance, ControlAffineGame, Game, make
 from hno.games.kinematics import distances, double_integrator_drift
 from hno.games.testing import ContractError, check_game
 from tests.lq import random_game
@@ -342,3 +342,10 @@ def test_shared_interests_are_not(recwarn):
     check_game(random_game(3))
     check_game(Encounter())
     assert not recwarn.list
+
+
+def test_keeping_distance_takes_two():
+    with pytest.raises(TypeError, match="One has one player, and CollisionAvoidance is for two or more"):
+
+        class One(CollisionAvoidance):
+            roles = (0,)

@@ -308,5 +308,15 @@ def test_an_answer_takes_one_thread_unless_told_otherwise(save: Save, monkeypatc
     monkeypatch.setattr(torch, "set_num_threads", seen.append)
     points = random_points(make("narrow_road"))
     for threads in (1, 2):
-        hno.load_policy(save(), threads=threads)(*points)
-    assert seen == [1, 7, 2, 7]
+        policy = hno.load_policy(save(), threads=threads)
+        for ask in (policy, policy.value, policy.costate):
+            ask(*points)
+    assert seen == [1, 7] * 3 + [2, 7] * 3
+
+
+def test_the_folder_of_a_run_is_enough(save: Save) -> None:
+    path = save()
+    points = random_points(make("narrow_road"))
+    assert torch.equal(hno.load_policy(path.parent)(*points), hno.load_policy(path)(*points))
+    path.unlink()
+    assert "There is no checkpoint at" in refused(path.parent)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -108,6 +109,8 @@ def test_what_comes_back_is_the_best_or_the_last_checkpoint(tmp_path: Path) -> N
     assert min(found.seconds.values()) > 0
     objective = make_objective({"value": {}}, {"value": 1.0})
     data, folder = labelled_data(), tmp_path / "none"
+    folder.mkdir()
+    shutil.copy(tmp_path / BEST, folder / BEST)  # of another run
     entries = record(operator.game, architecture(), Provenance("mine", TYPES))
     found = fit(operator, objective, data, settings(), folder, validation=[], record=entries)
     assert (found.best, found.checkpoint) == (None, folder / LAST)
