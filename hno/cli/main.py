@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import pkgutil
 import sys
 from collections.abc import Sequence
@@ -93,13 +94,16 @@ def main(given: Sequence[str] | None = None, prog: str | None = None) -> int:
         The exit code.
     """
     name, *rest = [*(sys.argv[1:] if given is None else given)] or ["--help"]
-    if name in ("-h", "--help", "help", "--version"):
-        print(f"hno {hno.__version__}" if name == "--version" else _overview())
-        return 0
     try:
+        if name in ("-h", "--help", "help", "--version"):
+            print(f"hno {hno.__version__}" if name == "--version" else _overview(), flush=True)
+            return 0
         if name not in COMMANDS:
             raise UsageError(unknown_name("command", name, list(COMMANDS)))
         return _run(COMMANDS[name], parse(rest), prog or f"hno {name}")
+    except BrokenPipeError:  # whoever read what is printed has read enough, as `head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
     except UsageError as error:
         print(error, file=sys.stderr)
         return 2
@@ -116,7 +120,7 @@ def _run(command: Command, given: Arguments, prog: str) -> int:
     if refused:
         raise UsageError(f"{prog} takes no {refused[0]}; its flags are {', '.join((*command.flags, '--help'))}.")
     if "--help" in given.flags:
-        print(_help(command, given, prog))
+        print(_help(command, given, prog), flush=True)
         return 0
     if command.config is not None and {"--shell-completion", "--hydra-help"} & given.flags.keys():
         from hno.cli.config import hydras_own

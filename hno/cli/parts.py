@@ -31,10 +31,12 @@ def checked(kind: str, name: object, given: object) -> dict[str, Any]:
     except LookupError as error:
         raise ValueError(f": {error}") from error
     options = options_of(factory, skip=skip) | {str(key): value for key, value in given.items()}
+    signature = inspect.signature(factory).parameters
     for key, default in options_of(factory, skip=skip).items():
         if options[key] is inspect.Parameter.empty:
             raise ValueError(f".{key} is missing: {kind} {name} has no default for it.")
-        expected, met = _LIKE.get(type(default), ("", lambda value: True))
+        whole = type(default) is int and signature[key].annotation in (float, "float")  # torch writes 0 for 0.0
+        expected, met = _LIKE.get(float if whole else type(default), ("", lambda value: True))
         if not met(options[key]):
             raise ValueError(f".{key} must be {expected}; got {options[key]!r}.")
     return options

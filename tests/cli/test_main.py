@@ -112,3 +112,11 @@ def test_to_is_the_output_folder(command: Command, tmp_path: Path) -> None:
     folder = tmp_path / "one, two"
     assert main(["train", *SMOKE, "trainer.max_steps=1", "--to", str(folder)]) == 0
     assert (folder / "results.json").exists()
+
+
+@pytest.mark.parametrize("words", ["--help", "train --help"])
+def test_help_whose_reader_has_gone_is_no_traceback(words: str) -> None:
+    command = f"{sys.executable} -m hno {words} | true"
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, shell=True, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+    assert done.stderr == ""

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 import hno
 from hno import registry
 from hno.cli import train
+from hno.cli.calls import train_settings
 from hno.cli.kinds import REGISTRIES
 from hno.data.sources import BoxSource, Known, Source
 from hno.games import Game, games
@@ -235,3 +236,10 @@ def test_a_part_that_cannot_be_built_fails_its_job_alone(
     assert run.code == 1
     assert "Job 0 failed: a mistake of its author" in run.text
     assert "#1" in run.text
+
+
+def test_an_option_whose_default_is_a_whole_number_may_be_a_fraction_where_it_says_so() -> None:
+    """Adam's weight decay is 0, of type float; SOAP's interval is a whole number."""
+    assert train_settings(["optimizer=adam", "optimizer.weight_decay=0.1"]).optimizer["weight_decay"] == 0.1
+    with pytest.raises(ValueError, match=r"precondition_frequency must be a whole number; got 2\.5"):
+        train_settings(["optimizer=soap", "optimizer.precondition_frequency=2.5"])
