@@ -82,7 +82,7 @@ def train(cache: Path, tmp_path: Path) -> Train:
         sampler: Mapping[str, Any] | None = None,
         optimizer: Mapping[str, Any] | None = None,
         trajectories: int = 6,
-        steps: int = 60,
+        steps: int = 200,
         record: Callable[[Game, Architecture], Mapping[str, Any]] | None = None,
     ) -> Trained:
         torch.manual_seed(0)

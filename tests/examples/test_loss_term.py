@@ -39,7 +39,7 @@ def test_the_recipe_is_a_method_by_yaml_alone(train: Train):
     terms, weights = (OmegaConf.to_object(config.loss[name]) for name in ("terms", "weights"))
     assert make_objective(terms, weights).terms["growing_residual"].steps == 30
     trained = train(make("tracking"), [(1, 1), (5, 5)], terms=terms, weights=weights)
-    assert trained.after < 0.7 * trained.before
+    assert trained.after < 0.5 * trained.before
     assert trained.fitted.metrics["loss/growing_residual"] > 0
 
 

@@ -51,7 +51,7 @@ def test_trains_and_is_loaded_with_its_options(train: Train):
         steps=150,
         record=lambda game, architecture: record(game, architecture, Provenance("sno")),
     )
-    assert trained.after < 0.7 * trained.before
+    assert trained.after < 0.5 * trained.before
     (network,) = hno.load_policy(trained.fitted.checkpoint).operator.networks
     assert isinstance(network, Parametric)
     assert [layer.out_features for layer in network.mlp.layers] == [32, 32, 1]

@@ -27,7 +27,7 @@ def test_it_solves_the_equation_without_a_label(tmp_path: Path, monkeypatch: pyt
     before = hji_residual(game, points, make_operator(game).field(points))
     operator, fitted = train(game, tmp_path, steps=100, rows=128)
     after = hji_residual(game, points, operator.field(points))
-    assert after.abs().median() < 0.7 * before.abs().median()
+    assert after.abs().median() < 0.5 * before.abs().median()
     assert fitted.best is None
     assert (tmp_path / "last.ckpt").exists()
     end = points._replace(tau=torch.zeros(200))

@@ -46,6 +46,6 @@ def test_trains_on_its_points(train: Train):
     sampler = {"coasting": {"share": 1.0, "spread": 0.0}}
     game = make("tracking")
     trained = train(game, [(1, 1)], terms=terms, weights={"value": 1, "costate": 1, "residual": 0.02}, sampler=sampler)
-    assert trained.after < 0.7 * trained.before
+    assert trained.after < 0.5 * trained.before
     points = trained.data.batch(3)["interior"].points
     assert (points.x[..., 1].abs() <= 0.5).all()  # the start box is that narrow, the PDE box is not
