@@ -55,10 +55,10 @@ def published_field(operator: ValueOperator, points: Points) -> Field:
     for player in range(game.players):
         own = tau.clone().requires_grad_()
         state = x.clone().requires_grad_()
-        myself, *others = ego_views(game.state_box.scale(state))[:, player].unbind(1)
+        views = ego_views(game.state_box.scale(state))[:, player].unbind(1)
         time = (2 * own / game.horizon - 1).unsqueeze(-1)
         role = [torch.full_like(time, game.roles[player])] * (len(set(game.roles)) > 1)
-        trunk = tanh_net(net.trunk, torch.cat([time, myself, *role, *others], -1))
+        trunk = tanh_net(net.trunk, torch.cat([time, *views, *role], -1))
         value = (trunk * tanh_net(net.branch, game.sensors(theta)[:, player])).sum(-1)
         slope, costate = torch.autograd.grad(value.sum(), (own, state), create_graph=True)
         values.append(value)
