@@ -21,7 +21,7 @@ from hno.evaluation.kernels import check_rows
 from hno.games import Game, make
 from hno.games.grid import parse_types
 from hno.losses import Objective, make_objective
-from hno.operators import Architecture, Choice, ValueOperator, make_operator
+from hno.operators import Architecture, Choice, make_operator
 from hno.training.fit import Settings
 from hno.training.optimizers import make_optimizer
 
@@ -40,7 +40,7 @@ def check(config: DictConfig) -> TrainSettings:
         if settings.validation.types is not None:
             parse_types(game, settings.validation.types, key="validation.types")
         operator, objective = make_operator(game, build_architecture(settings)), build_objective(settings)
-        build_data(settings, game, streams(objective, operator))
+        build_data(settings, game, objective.streams(exact_terminal=operator.meets_terminal))
         make_optimizer(steps=settings.trainer.max_steps, **settings.optimizer)
         if settings.evaluation.ntk:
             check_rows(operator, settings.evaluation.ntk_rows)
@@ -68,11 +68,6 @@ def _choice(content: dict[str, Any]) -> Choice:
 def build_objective(settings: TrainSettings) -> Objective:
     """The method: loss terms and weights."""
     return make_objective(**plain(settings.loss))
-
-
-def streams(objective: Objective, operator: ValueOperator) -> frozenset[str]:
-    """Streams of data that the terms of an objective read."""
-    return frozenset(term.stream for term in objective.used(exact_terminal=operator.meets_terminal).values())
 
 
 def build_data(settings: TrainSettings, game: Game, needed: frozenset[str], report: Report | None = None) -> GameData:

@@ -20,7 +20,6 @@ from hno.cli.build import (
     build_objective,
     build_settings,
     check,
-    streams,
 )  # fmt: skip
 from hno.cli.checkpoints import resumed
 from hno.cli.evaluate import evaluate_policy, solve_tests, unseen_types
@@ -115,7 +114,8 @@ def train_operator(settings: TrainSettings, folder: Path, results: Results) -> F
     use_threads(settings.trainer.threads)
     game, architecture, objective = build_game(settings.game), build_architecture(settings), build_objective(settings)
     operator = make_operator(game, architecture)
-    data = build_data(settings, game, streams(objective, operator), label_progress())
+    needed = objective.streams(exact_terminal=operator.meets_terminal)
+    data = build_data(settings, game, needed, label_progress())
     origin = Provenance(settings.operator["name"], data.type_list, settings.seed, config_hash(settings))
     entries, makers = record(game, architecture, origin), loggers(settings, folder)
     resume = None if settings.resume is None else resumed(settings.resume)

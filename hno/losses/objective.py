@@ -108,6 +108,10 @@ class Objective(nn.Module):
             )
         return found
 
+    def streams(self, *, exact_terminal: bool) -> frozenset[str]:
+        """Data streams that the terms that count read. Raises as `used`."""
+        return frozenset(term.stream for term in self.used(exact_terminal=exact_terminal).values())
+
     def residual(self, name: str, view: View) -> Tensor:
         """Residual of a term, in the size that it states if `scaled`."""
         term = self.terms[name]

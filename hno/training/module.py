@@ -39,13 +39,9 @@ class TrainingModule(L.LightningModule):
         super().__init__()
         self.operator, self.objective, self.optimizer, self.record = operator, objective, optimizer, record or {}
         self.terms = objective.used(exact_terminal=operator.meets_terminal)
+        self.streams = objective.streams(exact_terminal=operator.meets_terminal)
         self.value_error = WeightedMeanAbsolutePercentageError()
         self.costate_error = WeightedMeanAbsolutePercentageError()
-
-    @property
-    def streams(self) -> frozenset[str]:
-        """Data streams that the terms read."""
-        return frozenset(term.stream for term in self.terms.values())
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Weighted sum of the terms whose stream is in the batch; the others are logged as NaN."""

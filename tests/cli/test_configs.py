@@ -8,7 +8,7 @@ import pytest
 from omegaconf import DictConfig
 
 from hno.cli.arguments import Arguments
-from hno.cli.build import build_architecture, build_data, build_game, build_objective, check, streams
+from hno.cli.build import build_architecture, build_data, build_game, build_objective, check
 from hno.cli.calls import train_settings
 from hno.cli.config import choices, compose, config_dir, for_hydra, groups, register_plugins
 from hno.cli.results import config_hash
@@ -43,7 +43,7 @@ def settings(*overrides: str) -> TrainSettings:
 def data_of(chosen: TrainSettings) -> GameData:
     game = build_game(chosen.game)
     operator = make_operator(game, build_architecture(chosen))
-    return build_data(chosen, game, streams(build_objective(chosen), operator))
+    return build_data(chosen, game, build_objective(chosen).streams(exact_terminal=operator.meets_terminal))
 
 
 @pytest.mark.parametrize(("group", "choice"), CHOICES)

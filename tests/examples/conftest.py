@@ -89,10 +89,9 @@ def train(cache: Path, tmp_path: Path) -> Train:
         architecture = Architecture(network=network)
         operator = make_operator(game, architecture)
         objective = make_objective(terms, weights or dict.fromkeys(terms, 1.0))
-        used = objective.used(exact_terminal=operator.meets_terminal).values()
         data = GameData(
             game,
-            {term.stream for term in used},
+            objective.streams(exact_terminal=operator.meets_terminal),
             labels=LabelPlan(types=types, trajectories=trajectories, validation=2, cache=cache, workers=1),
             collocation=Collocation(make_sampler(sampler or {"box": 1.0}), Curriculum(0, 0)),
             batch_sizes={"bvp": 256, "interior": 64, "terminal": 64},

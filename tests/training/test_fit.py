@@ -168,7 +168,7 @@ def test_physics_alone_trains_without_a_label(
     weights = {"residual": 1.0, "boundary": 1.0}
     objective = make_objective({name: {} for name in weights}, weights)
     operator = small_operator(exact_terminal=exact)
-    streams = {term.stream for term in objective.used(exact_terminal=exact).values()}
+    streams = objective.streams(exact_terminal=exact)
     plan, where = LabelPlan(types=TYPES, cache=Path("unused")), Collocation(make_sampler(sampler))
     data = GameData(make("narrow_road"), streams, 0, plan, where, {"bvp": 8, "interior": 64, "terminal": 16})
     losses: list[float] = []
