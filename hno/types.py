@@ -6,6 +6,7 @@ Quantities are in physical units; `tau` is time to go (0 is terminal), `t` runs 
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from enum import IntEnum
 from typing import NamedTuple
@@ -32,26 +33,40 @@ class Types(NamedTuple):
     """Different types, shape (C, P)."""
     which: Tensor
     """Row of the table of each point, int64, shape (B,)."""
+    branch: Tensor | None = None
+    """Branch of a potential at each point, -1 for the best one, int64, shape (B,); None for the best one everywhere."""
+
+    def rows(self, index: Tensor) -> Types:
+        """Some of the points."""
+        return self._replace(which=self.which[index], branch=None if self.branch is None else self.branch[index])
 
 
 class Labels(NamedTuple):
     """What an operator is supervised with, at the points of the same row."""
 
     value: Tensor
-    """V_i = -J_i, shape (B, P)."""
+    """V_i = -J_i, shape (B, P); or the potential W, shape (B, 1)."""
     costate: Tensor
-    """dV_i / dx_j, shape (B, P, P, n)."""
+    """dV_i / dx_j, shape (B, P, P, n), or dW / dx_j, shape (B, 1, P, n)."""
+    players: Tensor | None = None
+    """V_i where the value is W, shape (B, P)."""
+    best: Tensor | None = None
+    """Whether no other equilibrium of the same start has a larger W, bool, shape (B,)."""
 
 
 class Field(NamedTuple):
-    """A value function and its derivatives at some points."""
+    """Value functions and their derivatives at some points: those of the players, Q = P, or a potential, Q = 1."""
 
     value: Tensor
-    """V_i, shape (B, P)."""
+    """V_i or W, shape (B, Q)."""
     dvalue_dtau: Tensor
-    """Derivative in time to go, 1/s, shape (B, P)."""
+    """Derivative in time to go, 1/s, shape (B, Q)."""
     costate: Tensor
-    """dV_i / dx_j, shape (B, P, P, n)."""
+    """dV_i / dx_j or dW / dx_j, shape (B, Q, P, n)."""
+    players: Tensor | None = None
+    """V_i where the value is W, shape (B, P)."""
+    branches: Tensor | None = None
+    """W of every branch, -inf for those that no label has, shape (B, branches)."""
 
 
 class Sample(NamedTuple):
@@ -71,8 +86,8 @@ class Sample(NamedTuple):
         """Some of the rows."""
         return Sample(
             Points(*(column[index] for column in self.points)),
-            None if self.labels is None else Labels(*(column[index] for column in self.labels)),
-            None if self.types is None else self.types._replace(which=self.types.which[index]),
+            None if self.labels is None else Labels(*(None if c is None else c[index] for c in self.labels)),
+            None if self.types is None else self.types.rows(index),
         )
 
 
@@ -134,6 +149,10 @@ class Extremal(NamedTuple):
     """V_i from t to the end, shape (B, K, P)."""
     theta: Tensor
     """Player types, shape (B, P)."""
+    potential: Tensor
+    """W from t to the end, see `hno.games.potential`; NaN where the game is no potential game, shape (B, K)."""
+    start: Tensor
+    """Which start state each trajectory belongs to, counted from 0, int64, shape (B,)."""
     clearance: Tensor
     """Smallest -constraint over players, their constraints and time, between the nodes too, shape (B,)."""
     reintegration: Tensor
@@ -150,16 +169,35 @@ class Extremal(NamedTuple):
         """Joint cost of the whole game, shape (B,)."""
         return -self.value[:, 0].sum(-1)
 
+    @property
+    def starts(self) -> int:
+        """Number of start states."""
+        return int(self.start[-1]) + 1 if len(self.start) else 0
+
 
 def join(parts: Sequence[Extremal]) -> Extremal:
-    """Extremals of one game, one after the other."""
+    """Extremals of one game, one after the other; their starts are counted on."""
     batched = {name: torch.cat([getattr(part, name) for part in parts]) for name in Extremal._fields if name != "t"}
-    return Extremal(t=parts[0].t, **batched)
+    before = list(itertools.accumulate((part.starts for part in parts), initial=0))
+    start = torch.cat([part.start + offset for part, offset in zip(parts, before, strict=False)])
+    return Extremal(t=parts[0].t, **{**batched, "start": start})
 
 
 def part(found: Extremal, rows: slice | Tensor) -> Extremal:
     """Some rows of extremals."""
     return Extremal(**{name: column if name == "t" else column[rows] for name, column in found._asdict().items()})
+
+
+def of_starts(found: Extremal, first: int, end: int | None = None) -> Extremal:
+    """The extremals of the start states from `first` to before `end`, which are counted anew."""
+    kept = part(found, (found.start >= first) & (found.start < (found.starts if end is None else end)))
+    return kept._replace(start=kept.start - first)
+
+
+def best_of(found: Extremal) -> Extremal:
+    """One extremal per start state: the first, which is the best where `solve` found several."""
+    new = found.start.diff(prepend=found.start.new_full((1,), -1)) != 0
+    return part(found, new)
 
 
 class Trajectory(NamedTuple):

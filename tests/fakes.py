@@ -45,6 +45,7 @@ def fake_labels(
     x = game.state_box.sample(count * nodes, generator).double().unflatten(0, (count, nodes))
     if start is not None:
         x[:, 0] = start
+    value = -normal(count, nodes, players).abs()
     return Extremal(
         status=torch.tensor([int(s) for s in status or [Status.CONVERGED] * count]),
         residual=normal(count).abs(),
@@ -52,8 +53,10 @@ def fake_labels(
         x=x,
         costate=normal(count, nodes, players, players, states),
         u=normal(count, nodes, players, game.control_dim),
-        value=-normal(count, nodes, players).abs(),
+        value=value,
         theta=torch.tensor(theta, dtype=torch.float64).expand(count, -1).contiguous(),
+        potential=value.sum(-1),
+        start=torch.arange(count),
         clearance=torch.tensor(clearance or [1.0] * count, dtype=torch.float64),
         reintegration=normal(count).abs() * 1e-6,
         local_gap=normal(count, players).abs() * 1e-6,
@@ -62,7 +65,9 @@ def fake_labels(
     )
 
 
-def fake_solve(game: Game, x0: Tensor, theta: Tensor, settings: Solver = Solver()) -> Extremal:
+def fake_solve(
+    game: Game, x0: Tensor, theta: Tensor, settings: Solver = Solver(), *, all_equilibria: bool = False
+) -> Extremal:
     """Fake labels in the place of `hno.pontryagin.solve.solve`; every row is a function of its start state and type."""
     seeds = [int.from_bytes(hashlib.sha256(start.numpy().tobytes()).digest()[:4]) for start in x0]
     rows = zip(theta.tolist(), seeds, x0, strict=True)

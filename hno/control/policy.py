@@ -60,7 +60,7 @@ class Answer(NamedTuple):
     value: Tensor
     """V_i, (P,)."""
     costate: Tensor
-    """dV_i / dx_j, (P, P, n)."""
+    """dV_i / dx_j, (P, P, n), or dW / dx_j, (1, P, n)."""
     control: Tensor
     """(P, m)."""
 
@@ -94,14 +94,39 @@ class Feedback(nn.Module, Policy):
             ValueError: shapes do not fit the game or each other, or an entry is not finite.
         """
         points = self._points(tau, x, theta)
-        return self.game.optimal_control(points.x, self.operator.field(points).costate).to(x.dtype)
+        return self.operator.problem.optimal_control(points.x, self.operator.field(points).costate).to(x.dtype)
 
     def value(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
         """V_i of every player, (B,), (B, P, n), (B, P) -> (B, P). Raises as `act`."""
-        return self.operator.field(self._points(tau, x, theta)).value.to(x.dtype)
+        field = self.operator.field(self._points(tau, x, theta))
+        return (field.value if field.players is None else field.players).to(x.dtype)
+
+    def potential(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
+        """W of an operator of a potential, (B,), (B, P, n), (B, P) -> (B,).
+
+        Raises:
+            ValueError: as `act`, or the operator has none.
+        """
+        self._require_potential()
+        return self.operator.field(self._points(tau, x, theta)).value.squeeze(-1).to(x.dtype)
+
+    def branch(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
+        """Which branch of a potential is played, int64, (B,), (B, P, n), (B, P) -> (B,); see `hno.data.branches`.
+
+        Raises:
+            ValueError: as `act`, or the operator has none.
+        """
+        self._require_potential()
+        branches = self.operator.field(self._points(tau, x, theta)).branches
+        assert branches is not None
+        return branches.argmax(-1)
+
+    def _require_potential(self) -> None:
+        if not self.operator.potential:
+            raise ValueError("This policy knows the players' values, no potential: train it with function=potential.")
 
     def costate(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
-        """dV_i / dx_j, (B,), (B, P, n), (B, P) -> (B, P, P, n). Raises as `act`."""
+        """dV_i / dx_j, (B,), (B, P, n), (B, P) -> (B, P, P, n), or dW / dx_j, (B, 1, P, n). Raises as `act`."""
         return self.operator.field(self._points(tau, x, theta)).costate.to(x.dtype)
 
     def answer(self, tau: Tensor, x: Tensor, theta: Tensor) -> Answer:
@@ -110,7 +135,7 @@ class Feedback(nn.Module, Policy):
         `torch.vmap`, `torch.func.jacrev` and `torch.compile` take it.
         """
         value, costate = self.operator.value_and_costate(tau, x, theta)
-        return Answer(value, costate, self.game.optimal_control(x, costate))
+        return Answer(value, costate, self.operator.problem.optimal_control(x, costate))
 
     def _points(self, tau: Tensor, x: Tensor, theta: Tensor) -> Points:
         """The question in the operator's floating-point type."""

@@ -13,13 +13,14 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset
 
+from hno.data.branches import principal_axes
 from hno.data.exchange import read_own
 from hno.data.labels import Report, Request, default_cache, labels_for
 from hno.data.plans import BATCH_SIZES, Collocation, LabelPlan
-from hno.data.rows import rows_of
+from hno.data.rows import converged, potential_rows, rows_of
 from hno.data.sources import Known, Pool, sample_points
 from hno.games import Game
-from hno.types import Batch, Extremal, Sample, Trajectory, Types, part
+from hno.types import Batch, Extremal, Sample, Trajectory, Types, best_of, of_starts
 
 BOX_TYPES = 32
 """Types that one batch of collocation points draws from the type box: the branch runs once for each."""
@@ -50,6 +51,7 @@ class GameData(L.LightningDataModule):
         collocation: which collocation points.
         batch_sizes: rows per step of each stream; None for every labelled row, each step.
         report: called as labels are written.
+        potential: label with the potential of every equilibrium rather than with the players' values at the best one.
 
     Raises:
         ValueError: sizes, types or shares that make no sense, or nothing to train on at some step.
@@ -64,8 +66,10 @@ class GameData(L.LightningDataModule):
         collocation: Collocation | None = None,
         batch_sizes: Mapping[str, int | None] = BATCH_SIZES,
         report: Report | None = None,
+        potential: bool = False,
     ) -> None:
         super().__init__()
+        self.potential = potential
         self.game = copy.deepcopy(game)  # the operator moves its own to a device; batches are made on the CPU
         self.streams, self.seed, self.labels, self.report = frozenset(streams), seed, labels, report
         self.collocation, self.batch_sizes = collocation or Collocation(), dict(batch_sizes)
@@ -76,10 +80,23 @@ class GameData(L.LightningDataModule):
         brought = [tuple(theta) for own in self.own for theta in own.theta.unique(dim=0).tolist()]
         self.type_list = list(dict.fromkeys([*solved, *brought]))
         self.types = torch.tensor(self.type_list)
-        self.requests = [Request(t, labels.trajectories + labels.validation, seed, "train") for t in solved]
+        shares = list(
+            zip(labels.widen, labels.shares(labels.trajectories), labels.shares(labels.validation), strict=True)
+        )
+        self.requests = [
+            Request(theta, trained + kept, seed, "train", widen, all_equilibria=potential)
+            for theta in solved
+            for widen, trained, kept in shares
+        ]
+        self.kept = [kept for _ in solved for *_, kept in shares] + [labels.validation] * len(self.own)
+        """Start states of each label set that are held out."""
+        self.branches: Tensor | None = None
+        """Axes of the potential's branches, see `hno.data.branches`, (pairs, 3)."""
         self.label_seconds = 0.0
         self.extremals: list[Extremal] = []
         self.train_rows: Sample | None = None
+        self.drawn = torch.empty(0, dtype=torch.int64)
+        """Rows that batches are drawn from: the best equilibria are there twice, the others once."""
         self.val_rows: Sample | None = None
         self.visits: list[Visit] = []
         """The latest two validations."""
@@ -103,9 +120,9 @@ class GameData(L.LightningDataModule):
     def _check_own(self) -> None:
         held_out = self.labels.validation
         for path, found in zip(self.labels.files, self.own, strict=True):
-            if len(found.status) <= held_out:
+            if found.starts <= held_out:
                 raise ValueError(
-                    f"{path} holds {len(found.status)} labels and {held_out} are held out: none is left to train on. "
+                    f"{path} holds {found.starts} labels and {held_out} are held out: none is left to train on. "
                     "Bring more, or lower data.validation."
                 )
 
@@ -131,16 +148,29 @@ class GameData(L.LightningDataModule):
         self.prepare_data()
         if not self.extremals:
             return
-        held_out = -self.labels.validation
-        self.train_rows = rows_of(self.game, [part(found, slice(held_out)) for found in self.extremals])
-        self.val_rows = rows_of(self.game, self.held_out())
+        trained = [of_starts(found, 0, found.starts - kept) for found, kept in self._split()]
+        held_out = [of_starts(found, found.starts - kept) for found, kept in self._split()]
+        if self.potential:
+            self.branches = principal_axes(self.game, converged(self.game, trained))
+            self.train_rows = potential_rows(self.game, trained, self.branches, swapped=True)
+            self.val_rows = potential_rows(self.game, held_out, self.branches)
+            assert self.train_rows.labels is not None and self.train_rows.labels.best is not None
+            best = self.train_rows.labels.best.nonzero().squeeze(-1)
+            self.drawn = torch.cat([torch.arange(self.train_rows.size), best])
+        else:
+            self.train_rows, self.val_rows = rows_of(self.game, trained), rows_of(self.game, held_out)
+            self.drawn = torch.arange(self.train_rows.size)
+
+    def _split(self) -> Iterator[tuple[Extremal, int]]:
+        """Labels of every set, and how many of its start states are held out."""
+        return zip(self.extremals, self.kept, strict=True)
 
     def held_out(self) -> list[Extremal]:
-        """Labels that are not trained on, one set per labelled type; none without labels."""
-        return [part(found, slice(-self.labels.validation, None)) for found in self.extremals]
+        """The best labels of start states that are not trained on, one set per request; none without labels."""
+        return [best_of(of_starts(found, found.starts - kept)) for found, kept in self._split()]
 
     def scales(self) -> tuple[Tensor, Tensor]:
-        """Typical sizes of values, scalar, and of costates, (P, P, n).
+        """Typical sizes of values, scalar, and of costates, (P, P, n) or (1, P, n).
 
         The mean absolute values and costates of the training labels; without labels, the mean terminal value over the
         PDE box, and that per width of the box. A state that hardly matters keeps a thousandth of value / box width, so
@@ -150,7 +180,8 @@ class GameData(L.LightningDataModule):
         if self.train_rows is None:
             x = self.game.state_box.sample(4096, torch.Generator().manual_seed(self.seed))
             value = self.game.terminal_value(x).abs().mean().clamp_min(1e-3)
-            return value, (value / width).expand(self.game.players, -1, -1).clone()
+            functions = 1 if self.potential else self.game.players
+            return value, (value / width).expand(functions, -1, -1).clone()
         labels = self.train_rows.labels
         assert labels is not None
         value = labels.value.abs().mean()
@@ -186,7 +217,8 @@ class GameData(L.LightningDataModule):
         batch: Batch = {}
         if "bvp" in self.streams and self.train_rows is not None:
             rows, size = self.train_rows, sizes["bvp"]
-            chosen = torch.arange(rows.size) if size is None else torch.randint(rows.size, (size,), generator=generator)
+            drawn = self.drawn
+            chosen = drawn if size is None else drawn[torch.randint(len(drawn), (size,), generator=generator)]
             batch["bvp"] = rows.rows(chosen)
         if self.collocation.curriculum.active(step):
             for name in sorted(self.streams & {"interior", "terminal"}):

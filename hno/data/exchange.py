@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.integrate import simpson
 from torch import Tensor
 
 from hno.data.store import LabelFileError, read_labels, write_labels
@@ -64,6 +65,11 @@ def _certified(game: Game, t: Tensor, x: Tensor, costate: Tensor, value: Tensor,
     share = torch.linspace(0, 1, 9, dtype=t.dtype)
     between = equations.split(equations.interpolate(at, share))[0].flatten(1, 2)
     along = theta.unsqueeze(1).expand(between.shape[:-1])
+    shared = torch.full_like(t.expand(len(x), -1), torch.nan)
+    if game.potential:  # W is the sum of values, but for penalties that count once
+        twice = game.uncontrolled_cost(between, along).sum(-1) - game.potential_cost(between, along)
+        each = torch.from_numpy(simpson(twice.unflatten(-1, (-1, len(share))), dx=1 / 8)) * t.diff()
+        shared = value.sum(-1) + torch.nn.functional.pad(each.flip(-1).cumsum(-1).flip(-1), (0, 1))
     return Extremal(
         status=torch.full((len(x),), int(Status.CONVERGED)),
         residual=torch.full((len(x),), torch.nan, dtype=torch.float64),
@@ -73,6 +79,8 @@ def _certified(game: Game, t: Tensor, x: Tensor, costate: Tensor, value: Tensor,
         u=u,
         value=value,
         theta=theta,
+        potential=shared,
+        start=torch.arange(len(x)),
         clearance=-game.constraint(between, along).amax((1, 2, 3)),
         reintegration=reintegration_error(game, at),
         local_gap=local_gap(game, at),

@@ -20,7 +20,7 @@ from hno.data.shards import SHARD, LabelSet
 from hno.data.store import canonical_json
 from hno.games import Game
 from hno.pontryagin.solve import Solver, solve
-from hno.types import Extremal, Status, part
+from hno.types import Extremal, Status, best_of, of_starts, part
 
 SOLVER_VERSION = 2
 """Counted up when the solver's results change, which makes cached labels stale."""
@@ -45,6 +45,8 @@ class Request(NamedTuple):
     """Width of the start box in units of the game's."""
     symmetric: bool = False
     """Whether all players start in the same own state, that of the first player."""
+    all_equilibria: bool = False
+    """Whether every equilibrium that is found is a label, not only the cheapest of each start."""
 
 
 class Progress(NamedTuple):
@@ -99,8 +101,9 @@ def provenance(game: Game, request: Request, settings: Solver) -> dict[str, Any]
     """Everything that determines labels, but for how many there are: row k of a set is always the same."""
     content = request._replace(theta=tuple(map(float, request.theta)))._asdict()
     del content["starts"]
-    if not request.symmetric:
-        del content["symmetric"]  # keeps the keys of sets that were solved before there were symmetric starts
+    for name in ("symmetric", "all_equilibria"):  # keeps the keys of sets that are older than these
+        if not content[name]:
+            del content[name]
     return {
         "game": type(game).__name__,
         "constants": _changed_constants(game),
@@ -224,17 +227,18 @@ class _Job(NamedTuple):
     x0: Tensor
     """Start states of the whole shard, as far as it is asked for."""
     have: int
-    """Rows that the shard has already."""
+    """Start states that the shard has already."""
     theta: tuple[float, ...]
+    all_equilibria: bool
 
 
 def _jobs(game: Game, labels: LabelSet, request: Request) -> Iterator[_Job]:
     """What a set lacks of a request; what it has is verified."""
     for shard, x0 in enumerate(start_states(game, request).split(SHARD)):
-        have = len(labels.read_shard(shard).status) if labels.rows(shard) else 0
+        have = labels.read_shard(shard).starts if labels.starts(shard) else 0
         if have < len(x0):
             labels.check_writable()
-            yield _Job(labels, shard, x0, have, request.theta)
+            yield _Job(labels, shard, x0, have, request.theta, request.all_equilibria)
 
 
 def _run(game: Game, jobs: Sequence[_Job], settings: Solver, workers: int | None) -> Iterator[Tensor]:
@@ -252,10 +256,14 @@ def _solve_alone(game: Game, job: _Job, settings: Solver) -> Tensor:
 
 
 def _solve_shard(game: Game, job: _Job, settings: Solver) -> Tensor:
-    """Solve the rows that a shard lacks and write it; another process may have done so meanwhile."""
-    have = job.labels.rows(job.shard)
+    """Solve the start states that a shard lacks and write it; another process may have done so meanwhile.
+
+    Returns:
+        The status of the best extremal of each of them.
+    """
+    have = job.labels.starts(job.shard)
     x0 = job.x0[have:]
     if len(x0) > 0:
         theta = torch.tensor(job.theta, dtype=torch.float64).expand(len(x0), -1)
-        job.labels.append(job.shard, have, solve(game, x0, theta, settings))
-    return job.labels.read_shard(job.shard).status[job.have : len(job.x0)]
+        job.labels.append(job.shard, have, solve(game, x0, theta, settings, all_equilibria=job.all_equilibria))
+    return best_of(of_starts(job.labels.read_shard(job.shard), job.have, len(job.x0))).status

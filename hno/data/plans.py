@@ -26,6 +26,8 @@ class LabelPlan:
     """Labelled trajectories per type."""
     validation: int = 16
     """Trajectories per type that are held out."""
+    widen: Sequence[float] = (1.0,)
+    """Widths of the boxes that starts are drawn from, in units of the game's start box, in equal shares."""
     files: Sequence[Path] = ()
     """Label files of your own, see `hno.data.exchange`; their types count as labelled."""
     cache: Path | None = None
@@ -33,6 +35,10 @@ class LabelPlan:
     solver: Solver = Solver()
     workers: int | None = None
     """Label processes; the number of cores by default."""
+
+    def shares(self, number: int) -> list[int]:
+        """So many trajectories in equal shares, one for each width; what cannot be shared goes to the first ones."""
+        return [number // len(self.widen) + (place < number % len(self.widen)) for place in range(len(self.widen))]
 
 
 @dataclass(frozen=True)

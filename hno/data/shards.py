@@ -14,18 +14,26 @@ from typing import Any
 import filelock
 
 from hno.data.certificates import summary
-from hno.data.store import LabelFileError, canonical_json, checksum, read_labels, replace_whole, row_count, write_labels
-from hno.types import Extremal, join, part
+from hno.data.store import (
+    LabelFileError,
+    canonical_json,
+    checksum,
+    read_labels,
+    replace_whole,
+    start_count,
+    write_labels,
+)
+from hno.types import Extremal, join, of_starts
 
 SHARD = 128
-"""Rows of a shard; the last one of a set may hold fewer until the set grows."""
+"""Start states of a shard; the last one of a set may hold fewer until the set grows."""
 MANIFEST = "manifest.json"
 """The manifest's name inside the folder of a set."""
 
 
 @dataclass(frozen=True)
 class LabelSet:
-    """Labels of one game, type and seed in files of `SHARD` rows, each written whole or not at all.
+    """Labels of one game, type and seed in files of `SHARD` start states, each written whole or not at all.
 
     Args:
         folder: where the shards are.
@@ -39,10 +47,10 @@ class LabelSet:
         """File of a shard."""
         return self.folder / f"shard-{shard:05}.safetensors"
 
-    def rows(self, shard: int) -> int:
-        """How many rows of a shard are there, by its header; its content is verified when it is read."""
+    def starts(self, shard: int) -> int:
+        """How many start states of a shard are there, by its header; its content is verified when it is read."""
         path = self.path(shard)
-        return row_count(path) if path.exists() else 0
+        return start_count(path) if path.exists() else 0
 
     def read_shard(self, shard: int) -> Extremal:
         """The rows of a shard.
@@ -56,33 +64,33 @@ class LabelSet:
         return labels
 
     def read(self, starts: int) -> Extremal:
-        """The first rows of the set.
+        """The labels of the first start states of the set.
 
         Raises:
-            LabelFileError: a shard is damaged, or there are fewer rows than asked for.
+            LabelFileError: a shard is damaged, or there are fewer start states than asked for.
         """
         found = []
         for shard in range((starts - 1) // SHARD + 1):
             wanted = min(SHARD, starts - shard * SHARD)
             labels = self.read_shard(shard)
-            if len(labels.status) < wanted:
-                raise LabelFileError(f"{self.path(shard)} holds {len(labels.status)} rows, expected {wanted}.")
-            found.append(part(labels, slice(wanted)))
+            if labels.starts < wanted:
+                raise LabelFileError(f"{self.path(shard)} holds {labels.starts} start states, expected {wanted}.")
+            found.append(of_starts(labels, 0, wanted))
         return join(found)
 
     def append(self, shard: int, have: int, labels: Extremal) -> None:
-        """Add rows to a shard that had `have` of them. Rows that another process added first are kept.
+        """Add start states to a shard that had `have` of them. What another process added first is kept.
 
         Raises:
-            LabelFileError: the shard has fewer rows than it had.
+            LabelFileError: the shard has fewer of them than it had.
         """
         with self._lock():
-            now = self.rows(shard)
+            now = self.starts(shard)
             if now < have:
-                raise LabelFileError(f"{self.path(shard)} shrank from {have} to {now} rows. Run again.")
-            if now >= have + len(labels.status):
+                raise LabelFileError(f"{self.path(shard)} shrank from {have} to {now} start states. Run again.")
+            if now >= have + labels.starts:
                 return
-            new = part(labels, slice(now - have, None))
+            new = of_starts(labels, now - have)
             write_labels(self.path(shard), join([self.read_shard(shard), new]) if now else new, self.provenance)
 
     def write_manifest(self) -> None:
@@ -106,7 +114,7 @@ class LabelSet:
 
     def _shards(self) -> list[dict[str, Any]]:
         paths = sorted(self.folder.glob("shard-*.safetensors"))
-        return [{"file": path.name, "rows": row_count(path), "sha256": checksum(path)} for path in paths]
+        return [{"file": path.name, "rows": start_count(path), "sha256": checksum(path)} for path in paths]
 
     def _drafts(self) -> list[Path]:
         """Our own unfinished files, and those of safetensors, which writes beside the file that it is to write."""

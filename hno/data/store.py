@@ -19,6 +19,8 @@ from hno.types import Extremal
 
 FORMAT = 2
 """Version of the file layout."""
+ADDED = {"potential", "start"}
+"""Columns that older files of this format lack."""
 KEY = "hno"
 """The metadata key that holds the canonical JSON."""
 
@@ -41,7 +43,7 @@ def write_labels(path: Path, labels: Extremal, provenance: Mapping[str, Any]) ->
         provenance: how they were made, JSON content.
     """
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in labels._asdict().items()}
-    header = {"format": FORMAT, "sha256": _digest(tensors), "provenance": dict(provenance)}
+    header = {"format": FORMAT, "sha256": _digest(tensors), "starts": labels.starts, "provenance": dict(provenance)}
     text = canonical_json(header)
     replace_whole(path, lambda draft: safetensors.torch.save_file(tensors, draft, metadata={KEY: text}))
 
@@ -86,23 +88,32 @@ def read_labels(path: Path) -> tuple[Extremal, dict[str, Any]]:
         found = header["format"], header["sha256"], header["provenance"]
     except (KeyError, ValueError, TypeError) as error:
         raise LabelFileError(f"{path} is a safetensors file without hno's metadata. {_ADVICE}") from error
-    if found[0] != FORMAT or set(tensors) != set(Extremal._fields):
+    if found[0] != FORMAT or set(tensors) | ADDED != set(Extremal._fields):
         raise LabelFileError(f"{path} has format {found[0]}, expected {FORMAT}. {_ADVICE}")
     if found[1] != _digest(tensors):
         raise LabelFileError(f"{path} is damaged: its content does not match its checksum. {_ADVICE}")
-    return Extremal(**tensors), found[2]
+    return Extremal(**{**_without_potential(tensors), **tensors}), found[2]
 
 
-def row_count(path: Path) -> int:
-    """How many rows a label file has, by its header.
+def _without_potential(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """What files lack that are older than potentials: theirs are unknown, and every row has a start of its own."""
+    return {
+        "potential": torch.full_like(tensors["value"][..., 0], torch.nan),
+        "start": torch.arange(len(tensors["status"])),
+    }
+
+
+def start_count(path: Path) -> int:
+    """How many start states a label file has, by its header.
 
     Raises:
         LabelFileError: not a label file.
     """
     try:
         with safetensors.safe_open(path, framework="pt") as file:
-            return int(file.get_slice("status").get_shape()[0])
-    except (safetensors.SafetensorError, OSError) as error:
+            header = json.loads((file.metadata() or {}).get(KEY, "{}"))
+            return int(header.get("starts", file.get_slice("status").get_shape()[0]))
+    except (safetensors.SafetensorError, OSError, ValueError, TypeError) as error:
         raise LabelFileError(f"{path} cannot be read as a label file ({error}). {_ADVICE}") from error
 
 

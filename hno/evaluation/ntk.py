@@ -163,6 +163,6 @@ def residuals(operator: ValueOperator, parameters: Parameters, point: Sample) ->
 
     (in_time, in_state), found = jacrev(value, argnums=(0, 1), has_aux=True)(tau, x)
     game, field = operator.game, Field(found, in_time, in_state)
-    view = View(game, point, field, operator.field, operator.scales, 0)
+    view = View(game, operator.problem, point, field, operator.field, operator.scales, 0)
     parts = [term.residual(view) / term.scale(view) for term in TERMS]
     return torch.cat([part.flatten() for part in parts])

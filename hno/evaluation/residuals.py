@@ -117,7 +117,7 @@ def _means(operator: ValueOperator, where: Points, bins: int) -> tuple[Any, ...]
 def hji(operator: ValueOperator, points: Points) -> tuple[Tensor, Tensor]:
     """The HJI residual, 1/s, and the size that the loss measures it in, both (B, P)."""
     term, field = HJIResidual(), operator.field(points)
-    view = View(operator.game, Sample(points), field, operator.field, operator.scales, 0)
+    view = View(operator.game, operator.problem, Sample(points), field, operator.field, operator.scales, 0)
     residual = term.residual(view)
     return residual, term.scale(view).expand_as(residual)
 

@@ -81,6 +81,8 @@ class Game(FinalMethods, nn.Module, abc.ABC):
     """Unit of the constraints, and so of the clearance."""
     distance_constraints: bool = True
     """Whether they are radii minus distances of `positions`; pictures draw the radius then."""
+    potential: bool = False
+    """Whether it is an exact potential game with the cost of states `potential_cost`, see `hno.games.potential`."""
 
     def __getattr__(self, name: str) -> Any:
         """Name what a game has not set, also where one of its properties needs it."""
@@ -127,6 +129,15 @@ class Game(FinalMethods, nn.Module, abc.ABC):
     def penalty(self, x: Tensor, theta: Tensor) -> Tensor:
         """Sum of soft constraints by default, 1/s, (B, P, n), (B, P) -> (B, P)."""
         return self.soft_constraint(self.constraint(x, theta)).sum(-1)
+
+    def potential_cost(self, x: Tensor, theta: Tensor) -> Tensor:
+        """Cost of states of the potential, 1/s, (B, P, n), (B, P) -> (B,): what players share counts once.
+
+        By default the state costs, and half of the penalties, each of which two players share. Where players bear a
+        penalty alone, or more than two share one, it is to be overridden.
+        """
+        share = 1.0 if self.players == 1 else 0.5
+        return self.state_cost(x, theta).sum(-1) + share * self.penalty(x, theta).sum(-1)
 
     def sensors(self, theta: Tensor) -> Tensor:
         """Branch input of an operator, (B, P) -> (B, P, S): by default the own type and those of the others, scaled.

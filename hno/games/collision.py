@@ -20,6 +20,7 @@ class CollisionAvoidance(ControlAffineGame):
     """
 
     positive: ClassVar[tuple[str, ...]] = ("radius", "sensor_spacing", "sensor_count")
+    potential = True
     radius: float
     """Collision radius at theta = 0, m."""
     first_sensor: float

@@ -30,6 +30,7 @@ class Intersection(ControlAffineGame):
 
     positive = ("growth", "speed")
     distance_constraints = False
+    potential = True
     cells = 20
     """Lattice cells of the sensors along each road."""
     cell = 0.75

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from hno.games.base import Game
+from hno.games.potential import GAP, potential_gap
 from hno.games.probe import Point, methods, points, require
 
 COSTATE_SCALES = (1.0, 30.0, 1000.0)  # with optimal controls inside the control box, at its border and far outside
@@ -29,7 +30,15 @@ def check_physics(game: Game) -> None:
         ContractError: the first promise that the game breaks.
     """
     checks = (_check_fingerprint, _check_decoupled, _check_optimality, _check_roles)
-    for check in (*checks, _check_periodic, _check_penalty, _check_starts, _check_signs, _warn_of_opposition):
+    for check in (
+        *checks,
+        _check_periodic,
+        _check_penalty,
+        _check_starts,
+        _check_signs,
+        _check_potential,
+        _warn_of_opposition,
+    ):
         check(game)
 
 
@@ -147,6 +156,15 @@ def _check_signs(game: Game) -> None:
     grows, falls = bool((bend("terminal_value") > 1e-3).all()), bool((bend("state_cost") < -1e-3).all())
     require(not grows, "a terminal_value that is a reward", "one that grows without bound for all players", remedy)
     require(not falls, "a state_cost that is a cost", "one that falls without bound for all players", remedy)
+
+
+def _check_potential(game: Game) -> None:
+    if game.potential:
+        gap = potential_gap(game)
+        expected = "a player's deviation to change its own running cost as much as potential_cost"
+        got = f"a difference of {gap:.3g} of the cost"
+        remedy = "Override potential_cost, with what players share counted once, or set potential = False."
+        require(gap <= GAP, expected, got, remedy)
 
 
 def _warn_of_opposition(game: Game) -> None:

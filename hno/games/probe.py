@@ -50,6 +50,7 @@ def methods(game: Game, at: Point) -> dict[str, tuple[Callable[[], Tensor], tupl
         "constraint": (lambda: game.constraint(at.x, at.theta), (players,)),
         "state_cost": (lambda: game.state_cost(at.x, at.theta), (players,)),
         "penalty": (lambda: game.penalty(at.x, at.theta), (players,)),
+        "potential_cost": (lambda: game.potential_cost(at.x, at.theta), ()),
         "running_cost": (lambda: game.running_cost(at.x, at.u, at.theta), (players,)),
         "hamiltonian": (lambda: game.hamiltonian(at.x, at.costate, at.u, at.theta), (players,)),
         "best_response": (lambda: game.best_response(at.x, own_costate(at.costate)), (players, controls)),

@@ -9,6 +9,7 @@ from typing import ClassVar, NamedTuple
 from torch import Tensor, nn
 
 from hno.games import Game
+from hno.games.potential import Problem
 from hno.registry import Registry
 from hno.types import Field, Points, Sample
 
@@ -24,13 +25,15 @@ class Scales(NamedTuple):
     value: Tensor
     """Of V_i, scalar."""
     costate: Tensor
-    """Of dV_i / dx_j, (P, P, n)."""
+    """Of dV_i / dx_j, (P, P, n), or of dW / dx_j, (1, P, n)."""
 
 
 class View(NamedTuple):
     """What a loss term sees of a training step."""
 
     game: Game
+    problem: Problem
+    """What the value function solves the Hamilton-Jacobi equation of: the game, or its `Team` where it is a potential."""
     sample: Sample
     """The rows of the term's stream, B of them."""
     field: Field
@@ -52,7 +55,7 @@ class LossTerm(nn.Module, abc.ABC):
 
     @abc.abstractmethod
     def residual(self, view: View) -> Tensor:
-        """Zero where the term is satisfied, shape (B, P, ...)."""
+        """Zero where the term is satisfied, shape (B, ...)."""
 
     @abc.abstractmethod
     def scale(self, view: View) -> Tensor:

@@ -6,18 +6,18 @@ from typing import final
 
 from torch import Tensor
 
-from hno.games import Game
+from hno.games.potential import Problem
 from hno.losses.base import LossTerm, View, losses
 from hno.types import Field, Points
 
 
-def hji_residual(game: Game, points: Points, field: Field) -> Tensor:
-    """HJI residual dV/dtau - max_u H of every player, (B, P).
+def hji_residual(problem: Problem, points: Points, field: Field) -> Tensor:
+    """HJI residual dV/dtau - max_u H of every player (B, P), or of the potential (B, 1).
 
     Zero for an exact equilibrium value (paper, eq. 3, in time to go).
     """
-    u = game.optimal_control(points.x, field.costate)
-    return field.dvalue_dtau - game.hamiltonian(points.x, field.costate, u, points.theta)
+    u = problem.optimal_control(points.x, field.costate)
+    return field.dvalue_dtau - problem.hamiltonian(points.x, field.costate, u, points.theta)
 
 
 @final
@@ -28,17 +28,17 @@ class HJIResidual(LossTerm):
     stream = "interior"
 
     def residual(self, view: View) -> Tensor:
-        """(B, P), 1/s."""
-        return hji_residual(view.game, view.sample.points, view.field)
+        """(B, Q), 1/s."""
+        return hji_residual(view.problem, view.sample.points, view.field)
 
     def scale(self, view: View) -> Tensor:
-        """Size of values per horizon, plus the cost of the state at each point, (B, P).
+        """Size of values per horizon, plus the cost of the state at each point, (B, Q).
 
         Without it, points deep inside the violation set, where it is thousands of times larger and where no
         equilibrium goes, would make up the whole loss.
         """
         points = view.sample.points
-        cost = view.game.uncontrolled_cost(points.x, points.theta)
+        cost = view.problem.uncontrolled_cost(points.x, points.theta)
         return view.scales.value / view.game.horizon + cost.abs()
 
 
@@ -51,8 +51,8 @@ class Boundary(LossTerm):
     met_by_exact_terminal = True
 
     def residual(self, view: View) -> Tensor:
-        """(B, P)."""
-        return view.field.value - view.game.terminal_value(view.sample.points.x)
+        """(B, Q)."""
+        return view.field.value - view.problem.terminal_value(view.sample.points.x)
 
     def scale(self, view: View) -> Tensor:
         """Size of values."""

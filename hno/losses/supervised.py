@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import final
 
+import torch
 from torch import Tensor
 
 from hno.losses.base import LossTerm, View, losses
@@ -19,13 +20,17 @@ def _labels(view: View) -> Labels:
 @final
 @losses.register("value")
 class ValueDeviation(LossTerm):
-    """Predicted minus labelled value."""
+    """Predicted minus labelled value; where that is a potential's, the players' values too."""
 
     stream = "bvp"
 
     def residual(self, view: View) -> Tensor:
-        """(B, P)."""
-        return view.field.value - _labels(view).value
+        """(B, P), or (B, 1 + P) of a potential."""
+        labels, field = _labels(view), view.field
+        off = field.value - labels.value
+        if labels.players is None or field.players is None:
+            return off
+        return torch.cat([off, field.players - labels.players], -1)
 
     def scale(self, view: View) -> Tensor:
         """Size of values."""
@@ -40,9 +45,33 @@ class CostateDeviation(LossTerm):
     stream = "bvp"
 
     def residual(self, view: View) -> Tensor:
-        """(B, P, P, n)."""
+        """(B, Q, P, n)."""
         return view.field.costate - _labels(view).costate
 
     def scale(self, view: View) -> Tensor:
         """Size of each costate component."""
         return view.scales.costate
+
+
+@final
+@losses.register("branches")
+class OtherBranches(LossTerm):
+    """How far any other branch of a potential exceeds the best equilibrium, which would be played in its place.
+
+    It is 0 for a value function without branches.
+    """
+
+    stream = "bvp"
+
+    def residual(self, view: View) -> Tensor:
+        """(B, branches)."""
+        labels, types, branches = _labels(view), view.sample.types, view.field.branches
+        if branches is None or labels.best is None or types is None or types.branch is None:
+            return torch.zeros_like(view.field.value)
+        own = torch.arange(branches.shape[-1], device=branches.device) == types.branch.unsqueeze(-1)
+        counts = labels.best.unsqueeze(-1) & ~own
+        return (branches - labels.value).clamp_min(0) * counts
+
+    def scale(self, view: View) -> Tensor:
+        """Size of values."""
+        return view.scales.value

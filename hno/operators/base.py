@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
 from hno.games import Game
+from hno.games.potential import Problem, Team
 from hno.losses import Scales
 from hno.registry import Registry
 from hno.types import Field, Points, Types
@@ -30,22 +31,27 @@ class ValueOperator(nn.Module, abc.ABC):
         game: the game.
     """
 
+    potential: ClassVar[bool] = False
+    """Whether it learns a potential W rather than the players' values V_i."""
     meets_terminal: bool = False
     """Whether V(0, x) = -g(x) holds by construction."""
     value_scale: Tensor
     """Typical size of values, scalar: what the operator's own outputs are multiplied with."""
     costate_scale: Tensor
-    """Typical sizes of costates, (P, P, n)."""
+    """Typical sizes of costates, (P, P, n), or (1, P, n) of a potential."""
 
     def __init__(self, game: Game) -> None:
         super().__init__()
         self.game = game
+        self.problem: Problem = Team(game) if self.potential else game
+        """What the value function solves the Hamilton-Jacobi equation of."""
+        functions = 1 if self.potential else game.players
         self.register_buffer("value_scale", torch.tensor(1.0))
-        self.register_buffer("costate_scale", torch.ones(game.players, game.players, game.state_dim))
+        self.register_buffer("costate_scale", torch.ones(functions, game.players, game.state_dim))
 
     @abc.abstractmethod
     def field(self, points: Points, types: Types | None = None) -> Field:
-        """Value, time derivative and every costate, of all players at once.
+        """Value, time derivative and every costate, of all players at once, or of the potential.
 
         With gradients enabled the result is differentiable in the parameters, but not in the points: see `value`.
 
@@ -68,7 +74,7 @@ class ValueOperator(nn.Module, abc.ABC):
 
     @abc.abstractmethod
     def value_and_costate(self, tau: Tensor, x: Tensor, theta: Tensor) -> tuple[Tensor, Tensor]:
-        """Values (P,) and costates (P, P, n) of one state, (), (P, n), (P,): a pure function as `value`."""
+        """Values (P,) and costates (Q, P, n) of one state, (), (P, n), (P,): a pure function as `value`."""
 
     def forward(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
         """The value."""
@@ -81,6 +87,9 @@ class ValueOperator(nn.Module, abc.ABC):
     def scales(self) -> Scales:
         """Typical sizes of values and costates."""
         return Scales(self.value_scale, self.costate_scale)
+
+    def set_branches(self, branch: Tensor) -> None:
+        """Play those branches of a potential only that labels have, int64, any shape; kept with the weights."""
 
     def set_scales(self, scales: Scales) -> None:
         """Fix the sizes in which outputs and residuals are measured; they are saved with the weights."""

@@ -89,6 +89,10 @@ class DeepONet(Network):
         """Value at each row, (R,)."""
         return torch.linalg.vecdot(self.trunk(self._pooled(y)), self.branch(sensors)[which])
 
+    def values(self, y: Tensor, sensors: Tensor, which: Tensor) -> Tensor:
+        """Values at each row for several branch inputs: the trunk runs once."""
+        return torch.linalg.vecdot(self.trunk(self._pooled(y)).unsqueeze(-2), self.branch(sensors)[which])
+
     def value_gradient(self, y: Tensor, sensors: Tensor, which: Tensor) -> tuple[Tensor, Tensor]:
         """Value at each row and its gradient in y.
 

@@ -58,6 +58,14 @@ class Network(nn.Module, abc.ABC):
             Shape (R,).
         """
 
+    def values(self, y: Tensor, sensors: Tensor, which: Tensor) -> Tensor:
+        """Values at each row for several branch inputs, `which` (R, M) -> (R, M), differentiable in everything.
+
+        A network that shares work between them overrides it. Other arguments as in `forward`.
+        """
+        columns = which.shape[-1]
+        return self(y.repeat_interleave(columns, 0), sensors, which.flatten()).view_as(which)
+
     def value_gradient(self, y: Tensor, sensors: Tensor, which: Tensor) -> tuple[Tensor, Tensor]:
         """Value at each row and its gradient in y, (R,) and (R, `Inputs.total`), differentiable in the parameters.
 

@@ -10,13 +10,14 @@ from torch import Tensor
 
 from hno.games import Game
 from hno.games.base import own_costate
+from hno.games.potential import Team
 from hno.pontryagin.certificates import global_gap, local_gap, reintegration_error
 from hno.pontryagin.collocation import Collocation, Iterate
 from hno.pontryagin.integrate import runge_kutta
 from hno.pontryagin.mesh import encounter_weight, graded_mesh, inner_times, label_places, label_times
 from hno.pontryagin.newton import Newton, Solved, newton, rescue
 from hno.pontryagin.saturation import nodes_at_kinks
-from hno.pontryagin.starts import Search, Starts, find_starts
+from hno.pontryagin.starts import Search, Starts, cheapest, find_starts
 from hno.pontryagin.sweep import costates, values
 from hno.pontryagin.threads import torch_threads
 from hno.types import Extremal, Status, join
@@ -35,8 +36,16 @@ class Solver(NamedTuple):
     """States that are solved together; bounds the memory."""
 
 
-def solve(game: Game, x0: Tensor, theta: Tensor, settings: Solver = Solver(), threads: int = 1) -> Extremal:
-    """The cheapest open-loop equilibrium found from several starts, for every initial state.
+def solve(
+    game: Game,
+    x0: Tensor,
+    theta: Tensor,
+    settings: Solver = Solver(),
+    threads: int = 1,
+    *,
+    all_equilibria: bool = False,
+) -> Extremal:
+    """The cheapest open-loop equilibrium found from several starts, for every initial state, or all that were found.
 
     Args:
         game: any game; it is solved in float64 on the device of `x0`.
@@ -44,9 +53,11 @@ def solve(game: Game, x0: Tensor, theta: Tensor, settings: Solver = Solver(), th
         theta: player types, (B, P).
         settings: solver settings.
         threads: of torch, see `torch_threads`.
+        all_equilibria: return every distinct equilibrium, not only the cheapest.
 
     Returns:
-        One extremal per row. Rows without a converged start carry the status and residual of their best attempt.
+        One extremal per row, or several, the cheapest first: `Extremal.start` says to which row of `x0` each belongs.
+        Rows without a converged start carry the status and residual of their best attempt.
 
     Raises:
         ValueError: wrong shapes or entries that are not finite.
@@ -59,7 +70,8 @@ def solve(game: Game, x0: Tensor, theta: Tensor, settings: Solver = Solver(), th
         game = copy.deepcopy(game).to(x0.device).double()
         x0, theta = x0.detach().clone().double(), theta.detach().clone().to(x0.device).double()
         parts = zip(x0.split(settings.chunk), theta.split(settings.chunk), strict=True)
-        return join([_describe(game, solve_on_mesh(game, *part, settings), settings) for part in parts])
+        found = [solve_on_mesh(game, *part, settings, all_equilibria=all_equilibria) for part in parts]
+        return join([_describe(game, part, settings) for part in found])
 
 
 def _check(game: Game, x0: Tensor, theta: Tensor) -> None:
@@ -80,7 +92,7 @@ def _first_bad_row(tensor: Tensor) -> int:
 
 
 class OnMesh(NamedTuple):
-    """The best trajectory of every state, on its own mesh."""
+    """The best trajectory of every state, or all of them, each on its own mesh."""
 
     at: Iterate
     """States and own costates."""
@@ -90,9 +102,13 @@ class OnMesh(NamedTuple):
     """`Status`, (B,)."""
     alternatives: Tensor
     """Sums of values of all starts, NaN where they did not converge, (B, S)."""
+    state: Tensor
+    """The row of x0 that each trajectory starts from, (B,)."""
 
 
-def solve_on_mesh(game: Game, x0: Tensor, theta: Tensor, settings: Solver = Solver()) -> OnMesh:
+def solve_on_mesh(
+    game: Game, x0: Tensor, theta: Tensor, settings: Solver = Solver(), *, all_equilibria: bool = False
+) -> OnMesh:
     """What `solve` does up to the certificates and the label grid: all states at once, in float64."""
     with torch.no_grad():
         starts = find_starts(copy.deepcopy(game).float(), x0.float(), theta.float(), settings.search)
@@ -108,12 +124,17 @@ def solve_on_mesh(game: Game, x0: Tensor, theta: Tensor, settings: Solver = Solv
         place, converged = _places(tried, found.status)
         hopeless = place[tried & ~converged.any(1, keepdim=True)]
         found = rescue(equations, iterate, found, hopeless, settings.newton)
-        best, totals = _best(_total(game, iterate._replace(z=found.z)), found, tried)
-        row = place.gather(1, best).squeeze(1)
-        picked, size, status = iterate._replace(z=found.z).rows(row), found.residual[row], found.status[row]
-        at, size, status = nodes_at_kinks(game, picked, size, status, settings.newton, settings.reintegration)
-        total = _total(game, at).where(status == Status.CONVERGED, torch.nan)
-        return OnMesh(at, size, status, totals.scatter(1, best, total.unsqueeze(1)))
+        iterate = iterate._replace(z=found.z)
+        best, totals = _best(_total(game, iterate), found, tried)
+        start, state = best.squeeze(1), torch.arange(len(x0), device=x0.device)
+        if all_equilibria:
+            state, start = _distinct(game, iterate, place, totals, best)
+        row = place[state, start]
+        at, size, status = nodes_at_kinks(
+            game, iterate.rows(row), found.residual[row], found.status[row], settings.newton, settings.reintegration
+        )
+        totals[state, start] = _total(game, at).where(status == Status.CONVERGED, torch.nan)
+        return OnMesh(at, size, status, totals[state], state)
 
 
 def _initial_iterate(game: Game, x: Tensor, u: Tensor, theta: Tensor, extra: int) -> Iterate:
@@ -188,19 +209,39 @@ def _best(total: Tensor, found: Solved, tried: Tensor) -> tuple[Tensor, Tensor]:
     return score.masked_fill(~tried, -torch.inf).argmax(1, keepdim=True), totals
 
 
+def _distinct(game: Game, at: Iterate, place: Tensor, totals: Tensor, best: Tensor) -> tuple[Tensor, Tensor]:
+    """The state and the start of every distinct equilibrium, those of one state together and the best one first.
+
+    A state without an equilibrium has its best attempt.
+    """
+    row = place.where(totals.isfinite(), place.gather(1, best))
+    nodes = label_places(at.t, label_times(game, dtype=at.t.dtype, device=at.t.device))
+    x = Collocation(game).split(at.z)[0][torch.arange(len(nodes), device=nodes.device).unsqueeze(-1), nodes]
+    cost, order = cheapest(x[row.flatten()], -totals.nan_to_num(-torch.inf).flatten(), len(row))
+    start, found = order % row.shape[1], cost.isfinite()
+    start[:, :1], found[:, 0] = best, True
+    state, rank = found.nonzero().unbind(-1)
+    return state, start[state, rank]
+
+
 def _describe(game: Game, found: OnMesh, settings: Solver) -> Extremal:
     """Extremals on the label grid, with their certificates."""
-    at, residual, status, totals = found
+    at, residual, status, totals, state = found
     path = x, u, middle = along_mesh(game, at)
     costate = costates(game, at.t, *path, at.theta)
     value = values(game, at.t, *path, at.theta)
+    if game.potential:
+        potential = values(Team(game), at.t, *path, at.theta).squeeze(-1)
+    else:
+        potential = torch.full_like(at.t, torch.nan)
     everywhere = torch.cat([x, middle[0]], 1)
     clearance = -game.constraint(everywhere, at.theta.unsqueeze(1).expand(everywhere.shape[:-1])).amax((1, 2, 3))
     t = label_times(game, dtype=x.dtype, device=x.device)
     drift = reintegration_error(game, at)
     astray = (status == Status.CONVERGED) & (drift > settings.reintegration)
     rows = torch.arange(len(x), device=x.device).unsqueeze(-1)
-    x, costate, u, value = (part[rows, label_places(at.t, t)] for part in (x, costate, u, value))
+    nodes = label_places(at.t, t)
+    x, costate, u, value, potential = (part[rows, nodes] for part in (x, costate, u, value, potential))
     return Extremal(
         status=status.masked_fill(astray, Status.INACCURATE),
         residual=residual,
@@ -210,6 +251,8 @@ def _describe(game: Game, found: OnMesh, settings: Solver) -> Extremal:
         u=u,
         value=value,
         theta=at.theta,
+        potential=potential,
+        start=state,
         clearance=clearance,
         reintegration=drift,
         local_gap=local_gap(game, at),

@@ -64,12 +64,12 @@ def find_starts(game: Game, start: Tensor, theta: Tensor, search: Search) -> Sta
     v, _ = best_amplitude(guarded, start[rows], base, shapes.repeat(size, 1, 1, 1), search.amplitudes)
     for iterations, kept in search.rounds:
         x, v, cost = descend(guarded, start[rows], v, iterations, search.tolerance)
-        best = _cheapest(x, cost, size)[1][:, :kept].flatten()
+        best = cheapest(x, cost, size)[1][:, :kept].flatten()
         rows, v, guarded = rows[best], v[best], guarded.rows(best)
     exact = HeldControls(game, t, theta[rows], points=search.points, distinct=guarded.distinct)
     v = v.repeat_interleave(search.coarse, 1)[:, : exact.steps]
     x, v, cost = descend(exact, start[rows], v, search.fine_iterations, search.tolerance)
-    cost, order = _cheapest(x, cost, size)
+    cost, order = cheapest(x, cost, size)
     return Starts(x[order], exact.control(v)[order], cost)
 
 
@@ -116,7 +116,7 @@ def best_amplitude(
     return torch.stack(tried)[best, rows], cost
 
 
-def _cheapest(x: Tensor, cost: Tensor, size: int, tolerance: float = 1e-2) -> tuple[Tensor, Tensor]:
+def cheapest(x: Tensor, cost: Tensor, size: int, tolerance: float = 1e-2) -> tuple[Tensor, Tensor]:
     """Sort the starts of each state by cost, with repetitions of a cheaper one last.
 
     Args:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from hno.games import Game
+from hno.games.potential import Team
 from hno.pontryagin.adjoint import cost_gradient, dynamics_jacobian, terminal_costate
 
 
@@ -49,11 +50,13 @@ def _adjoint_terms(game: Game, x: Tensor, u: Tensor, theta: Tensor) -> tuple[Ten
     return dynamics_jacobian(game, x, u).mT, cost_gradient(game, x, types)
 
 
-def values(game: Game, t: Tensor, x: Tensor, u: Tensor, middle: tuple[Tensor, Tensor], theta: Tensor) -> Tensor:
-    """V_i from each node to the end by Simpson's rule, (B, K, P). Arguments as for `costates`."""
+def values(
+    problem: Game | Team, t: Tensor, x: Tensor, u: Tensor, middle: tuple[Tensor, Tensor], theta: Tensor
+) -> Tensor:
+    """V_i, or W of a team, from each node to the end by Simpson's rule, (B, K, Q). Arguments as for `costates`."""
     types = theta.unsqueeze(-2)
-    cost = game.running_cost(x, u, types.expand(x.shape[:-1]))
-    centre = game.running_cost(*middle, types.expand(middle[0].shape[:-1]))
+    cost = problem.running_cost(x, u, types.expand(x.shape[:-1]))
+    centre = problem.running_cost(*middle, types.expand(middle[0].shape[:-1]))
     spent = t.diff(dim=-1).unsqueeze(-1) / 6 * (cost[:, :-1] + 4 * centre + cost[:, 1:])
     to_go = spent.flip(1).cumsum(1).flip(1)
-    return game.terminal_value(x[:, -1]).unsqueeze(1) - torch.nn.functional.pad(to_go, (0, 0, 0, 1))
+    return problem.terminal_value(x[:, -1]).unsqueeze(1) - torch.nn.functional.pad(to_go, (0, 0, 0, 1))

@@ -56,6 +56,9 @@ class Settings:
     """`torch.compile` in runs of at least `LONG` steps."""
 
 
+_LEARNED = {False: "the players' values", True: "a potential"}
+
+
 class Fitted(NamedTuple):
     """What came of a training."""
 
@@ -103,6 +106,11 @@ def fit(
     Raises:
         DivergedError: the loss, or the error on held-out labels, is no longer sound.
     """
+    if data.potential != operator.potential:
+        raise ValueError(
+            f"The operator learns {_LEARNED[operator.potential]}, the data label {_LEARNED[data.potential]}: make them "
+            "alike with GameData(potential=operator.potential)."
+        )
     optimizer = make_optimizer(steps=settings.steps, **settings.optimizer)
     module = TrainingModule(operator, objective, optimizer, record)
     if settings.compile and settings.steps >= LONG:
@@ -110,6 +118,8 @@ def fit(
     data.setup("fit")
     if objective.scaled:
         operator.set_scales(Scales(*data.scales()))
+    if data.train_rows is not None and data.train_rows.types is not None and data.train_rows.types.branch is not None:
+        operator.set_branches(data.train_rows.types.branch)
     watch = ClosedLoopValidation(folder, settings.validate_every, dt=settings.dt, stop=settings.stop_when_safe)
     watch.begin(safe_sets(data.held_out()) if validation is None else validation, later)
     trainer = make_trainer(settings, folder, loggers, [watch, *callbacks])

@@ -61,7 +61,7 @@ class TrainingModule(L.LightningModule):
         sizes = [sample.size for sample in kept.values()]
         reduced = list[list[Tensor]]()
         for member in self.operator.members:
-            columns = (part.split(sizes) for part in member(points, types))
+            columns = [[None] * len(sizes) if part is None else part.split(sizes) for part in member(points, types)]
             fields = dict(zip(kept, (Field(*parts) for parts in zip(*columns, strict=True)), strict=True))
             views = {stream: self._view(kept[stream], fields[stream], member) for stream in kept}
             reduced.append([self.objective.reduced(name, views[stream]) for name, stream in read.items()])
@@ -69,7 +69,15 @@ class TrainingModule(L.LightningModule):
 
     def _view(self, sample: Sample, field: Field, member: FieldFunction) -> View:
         operator = self.operator
-        return View(operator.game, sample, field, lambda at: member(at, None), operator.scales, self.global_step)
+        return View(
+            operator.game,
+            operator.problem,
+            sample,
+            field,
+            lambda at: member(at, None),
+            operator.scales,
+            self.global_step,
+        )
 
     def _hardest(self, stream: str, sample: Sample) -> Sample:
         """The collocation points of the largest residuals, if only those count."""

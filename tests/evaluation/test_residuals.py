@@ -98,7 +98,7 @@ def test_means_are_those_of_the_loss_term(operator: ValueOperator) -> None:
         found.x.flatten(0, 1).float(),
         torch.tensor([[2.0, 3.0]] * 5 * nodes),
     )
-    view = View(game, Sample(points), operator.field(points), operator.field, operator.scales, 0)
+    view = View(game, game, Sample(points), operator.field(points), operator.field, operator.scales, 0)
     residual, scale = HJIResidual().residual(view), HJIResidual().scale(view)
     assert row.points == 5 * nodes
     assert row.physical == pytest.approx(residual.abs().mean().item(), rel=1e-5)

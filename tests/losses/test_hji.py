@@ -18,7 +18,7 @@ def view(game, at: Points, field: Field) -> View:
     def nowhere(_: Points) -> Field:
         raise AssertionError("no term looks at other points")
 
-    return View(game, Sample(at), field, nowhere, Scales(torch.tensor(1.0), torch.tensor(1.0)), 0)
+    return View(game, game, Sample(at), field, nowhere, Scales(torch.tensor(1.0), torch.tensor(1.0)), 0)
 
 
 def points(game, size: int = 32, seed: int = 0) -> Points:

@@ -1,0 +1,149 @@
+"""The operator of a potential game: one function W for all players, the largest of several smooth branches."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from typing import final
+
+import torch
+from torch import Tensor
+from torch.func import jacrev
+
+from hno.games import Game
+from hno.operators.base import ValueOperator, operators
+from hno.operators.deeponet import DeepONet
+from hno.operators.inputs import JointEncoding, distinct_types
+from hno.operators.network import Inputs, Network
+from hno.operators.value_gradient import compiled
+from hno.types import Field, Points, Types
+
+MOST = 64
+"""Branches that an operator may have; each costs one more product for every row."""
+
+
+@final
+@operators.register("potential")
+class PotentialOperator(ValueOperator):
+    """The potential W of all players, and every player's value V_i; controls follow from dW / dx_i alone.
+
+    Where the cheapest equilibrium changes from one way around each other to another, W has a ridge. It is the maximum of
+    branches, one for each combination of sides on which pairs of players pass (`hno.data.branches`), and each branch is
+    smooth. One network gives all of them: its branch input is the game's sensors, the sides, and which of W and V_i it is.
+
+    Args:
+        game: a potential game.
+        network: builds one network for the sizes of its inputs.
+        exact_terminal: W = sum of terminal values + (tau / horizon) N rather than N, so that the boundary condition holds
+            exactly; V_i likewise.
+
+    Raises:
+        ValueError: the game is no potential game, or has too many combinations of sides.
+    """
+
+    potential = True
+    active: Tensor
+    """Whether a label has the branch, (K,)."""
+
+    def __init__(self, game: Game, network: Callable[[Inputs], Network], exact_terminal: bool = True) -> None:
+        super().__init__(game)
+        pairs = game.players * (game.players - 1) // 2
+        if 2**pairs > MOST:
+            raise ValueError(
+                f"{game.players} players have {2**pairs} combinations of sides, more than the {MOST} branches that an "
+                "operator may have. Learn the players' values instead (function=value)."
+            )
+        self.meets_terminal = exact_terminal
+        # bit k of a branch's number is the side of pair k
+        sides = torch.tensor(list(itertools.product((-1.0, 1.0), repeat=pairs))).view(2**pairs, pairs).flip(-1)
+        self.register_buffer("sides", sides, persistent=False)
+        self.register_buffer("active", torch.ones(len(sides), dtype=torch.bool))
+        size = self._sensors((game.type_box.lo + game.type_box.hi).unsqueeze(0) / 2).shape[-1]
+        self.encoding = JointEncoding(game, size)
+        self.network = network(self.encoding.sizes)
+
+    def compile_kernels(self) -> None:
+        """Train through `torch.compile`."""
+        if isinstance(self.network, DeepONet):
+            self.network.kernels = compiled()
+
+    def set_branches(self, branch: Tensor) -> None:
+        """Play those branches only that labels have."""
+        self.active.zero_()[branch.unique()] = True
+
+    def value(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
+        """V_i of the branch that is played, (B, P)."""
+        branches, players = self._functions(tau, x, theta, self._heads(tau, x, theta))
+        return _chosen(players, branches.argmax(-1))
+
+    def value_and_costate(self, tau: Tensor, x: Tensor, theta: Tensor) -> tuple[Tensor, Tensor]:
+        """V_i (P,) and dW / dx_j (1, P, n) of one state."""
+
+        def functions(x: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+            at = tau.unsqueeze(0), x.unsqueeze(0), theta.unsqueeze(0)
+            branches, players = self._functions(*at, self._heads(*at))
+            return branches.squeeze(0), (branches.squeeze(0), players.squeeze(0))
+
+        slopes, (branches, players) = jacrev(functions, has_aux=True)(x)
+        best = branches.argmax(-1)
+        return _chosen(players, best), _chosen(slopes, best).unsqueeze(0)
+
+    def field(self, points: Points, types: Types | None = None) -> Field:
+        """W, its derivatives and V_i, of the branch in `types` or the best one."""
+        tau, x, theta = points
+        types = types or distinct_types(theta)
+        y, sensors = self.encoding(tau, x), self._sensors(types.distinct)
+        kinds = 1 + self.game.players
+        first = types.which.unsqueeze(-1) * (len(self.sides) * kinds)
+        heads = self.network.values(y, sensors, first + torch.arange(len(self.sides) * kinds, device=y.device))
+        branches, players = self._functions(tau, x, theta, heads)
+        branch = branches.argmax(-1)
+        if types.branch is not None:
+            branch = torch.where(types.branch < 0, branch, types.branch)
+        raw, gradient = self.network.value_gradient(y, sensors, first.squeeze(-1) + branch * kinds)
+        value, slope = raw * self.value_scale, self.encoding.time_slope(gradient) * self.value_scale
+        costate = self.encoding.state_slope(gradient, x, self.value_scale)
+        if self.meets_terminal:
+            share = tau / self.game.horizon
+            slope = value / self.game.horizon + share * slope
+            with torch.inference_mode(mode=False), torch.enable_grad():
+                at = x.detach().clone().requires_grad_()
+                end = self.game.terminal_value(at).sum(-1)
+                (push,) = torch.autograd.grad(end.sum(), at)
+            value = end.detach() + share * value
+            costate = push.unsqueeze(-3) + share[..., None, None, None] * costate
+        return Field(value.unsqueeze(-1), slope.unsqueeze(-1), costate, _chosen(players, branch), branches)
+
+    def branch(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
+        """Which branch is played, (B,), (B, P, n), (B, P) -> (B,)."""
+        return self._functions(tau, x, theta, self._heads(tau, x, theta))[0].argmax(-1)
+
+    def _heads(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
+        """Raw network outputs, (B, K (1 + P)), by a pure function."""
+        y = self.encoding(tau, x)
+        columns = len(self.sides) * (1 + self.game.players)
+        which = torch.arange(len(y) * columns, device=y.device).view(len(y), columns)
+        return self.network.values(y, self._sensors(theta), which)
+
+    def _functions(self, tau: Tensor, x: Tensor, theta: Tensor, heads: Tensor) -> tuple[Tensor, Tensor]:
+        """W (B, K), -inf for branches without labels, and V_i (B, K, P) of every branch, from the network's outputs."""
+        found = heads.unflatten(-1, (len(self.sides), -1)) * self.value_scale
+        if self.meets_terminal:
+            rewards = self.game.terminal_value(x)
+            end = torch.cat([rewards.sum(-1, keepdim=True), rewards], -1).unsqueeze(-2)
+            found = end + (tau / self.game.horizon)[..., None, None] * found
+        return found[..., 0].masked_fill(~self.active, -torch.inf), found[..., 1:]
+
+    def _sensors(self, theta: Tensor) -> Tensor:
+        """Branch inputs of every type, branch and function, the function running fastest, (C, P) -> (C K (1 + P), S)."""
+        game, kinds = self.game, 1 + self.game.players
+        each = game.sensors(theta).flatten(-2)[:, None, None]
+        sides, kind = self.sides.to(each)[:, None], torch.eye(kinds, dtype=each.dtype, device=each.device)
+        size = len(theta), len(self.sides), kinds
+        return torch.cat([each.expand(*size, -1), sides.expand(*size, -1), kind.expand(*size, -1)], -1).flatten(0, 2)
+
+
+def _chosen(table: Tensor, which: Tensor) -> Tensor:
+    """The entry of each row, (B, K, ...) and (B,) -> (B, ...), or (K, ...) and () -> (...)."""
+    index = which[(..., *(None,) * (table.dim() - which.dim()))]
+    return table.take_along_dim(index, which.dim()).squeeze(which.dim())
