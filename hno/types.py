@@ -53,6 +53,11 @@ class Labels(NamedTuple):
     best: Tensor | None = None
     """Whether no other equilibrium of the same start has a larger W, bool, shape (B,)."""
 
+    def rows(self, index: Tensor) -> Labels:
+        """Some of the points."""
+        known = {name: column[index] for name, column in self._asdict().items() if column is not None}
+        return Labels(**known)
+
 
 class Field(NamedTuple):
     """Value functions and their derivatives at some points: those of the players, Q = P, or a potential, Q = 1."""
@@ -86,7 +91,7 @@ class Sample(NamedTuple):
         """Some of the rows."""
         return Sample(
             Points(*(column[index] for column in self.points)),
-            None if self.labels is None else Labels(*(None if c is None else c[index] for c in self.labels)),
+            None if self.labels is None else self.labels.rows(index),
             None if self.types is None else self.types.rows(index),
         )
 

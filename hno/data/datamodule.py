@@ -154,9 +154,10 @@ class GameData(L.LightningDataModule):
             self.branches = principal_axes(self.game, converged(self.game, trained))
             self.train_rows = potential_rows(self.game, trained, self.branches, swapped=True)
             self.val_rows = potential_rows(self.game, held_out, self.branches)
-            assert self.train_rows.labels is not None and self.train_rows.labels.best is not None
-            best = self.train_rows.labels.best.nonzero().squeeze(-1)
-            self.drawn = torch.cat([torch.arange(self.train_rows.size), best])
+            labels = self.train_rows.labels
+            assert labels is not None
+            assert labels.best is not None
+            self.drawn = torch.cat([torch.arange(self.train_rows.size), labels.best.nonzero().squeeze(-1)])
         else:
             self.train_rows, self.val_rows = rows_of(self.game, trained), rows_of(self.game, held_out)
             self.drawn = torch.arange(self.train_rows.size)

@@ -47,8 +47,8 @@ def potential_rows(game: Game, extremals: Sequence[Extremal], axes: Tensor, *, s
     for found in converged(game, extremals):
         if not bool(found.potential.isfinite().all()):
             raise ValueError(
-                f"Labels of {type(game).__name__} without a potential cannot train one: they are older than potentials, or "
-                "the game's `potential` is False. Solve them anew, or use function=value."
+                f"Labels of {type(game).__name__} without a potential cannot train one: they are older than it, "
+                "or the game's `potential` is False. Solve them anew, or use function=value."
             )
         best = best_equilibria(found)
         for order in orders(game) if swapped else [list(range(game.players))]:

@@ -25,9 +25,8 @@ def fingerprint(game: Game) -> str:
     values = [corner for box in boxes for corner in (box.lo, box.hi)]
     values += [game.dynamics(x, u), game.effort(u), game.terminal_value(x), game.constraint(x, theta)]
     values += [game.sensors(theta), game.positions(x), game.soft_constraint(torch.linspace(-2, 2, 9, dtype=x.dtype))]
-    values += [
-        getattr(game, name)(x, theta) for name in ("state_cost", "penalty", "potential_cost") if game.overrides(name)
-    ]
+    optional = (name for name in ("state_cost", "penalty", "potential_cost") if game.overrides(name))
+    values += [getattr(game, name)(x, theta) for name in optional]
     digits = [f"{v:.4e}" for tensor in values for v in tensor.flatten().tolist()]
     text = repr((type(game).__name__, game.horizon, game.label_step, game.roles, digits))
     return hashlib.sha256(text.encode()).hexdigest()[:16]

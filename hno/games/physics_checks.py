@@ -29,16 +29,8 @@ def check_physics(game: Game) -> None:
     Raises:
         ContractError: the first promise that the game breaks.
     """
-    checks = (_check_fingerprint, _check_decoupled, _check_optimality, _check_roles)
-    for check in (
-        *checks,
-        _check_periodic,
-        _check_penalty,
-        _check_starts,
-        _check_signs,
-        _check_potential,
-        _warn_of_opposition,
-    ):
+    checks = (_check_fingerprint, _check_decoupled, _check_optimality, _check_roles, _check_periodic, _check_penalty)
+    for check in (*checks, _check_starts, _check_signs, _check_potential, _warn_of_opposition):
         check(game)
 
 

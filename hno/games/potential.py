@@ -33,9 +33,9 @@ class Problem(Protocol):
 class Team(Problem):
     """All players of a potential game as one, who maximises the potential W.
 
-    W(tau, x) = max over all controls of sum_i (terminal value - efforts) - integral of `Game.potential_cost`. Players who
-    deviate alone gain what W gains, so its optimal controls are an open-loop equilibrium, and dW / dx_i is the costate of
-    player i with respect to its own state.
+    W(tau, x) = max over all controls of sum_i (terminal value - efforts) - integral of `Game.potential_cost`. Players
+    who deviate alone gain what W gains, so its optimal controls are an open-loop equilibrium, and dW / dx_i is the
+    costate of player i with respect to its own state.
 
     Args:
         game: a potential game.
@@ -80,8 +80,8 @@ def require_potential(game: Game) -> None:
     if gap > GAP:
         found = f"misses by {gap:.3g} of the cost" if game.potential else "does not say that it is one (`potential`)"
         raise ValueError(
-            f"{type(game).__name__} {found}: in a potential game a player who deviates alone changes its own running cost "
-            "as much as `potential_cost`. State that method, or learn the players' values with function=value."
+            f"{type(game).__name__} {found}: in a potential game a player who deviates alone changes its own running "
+            "cost as much as `potential_cost`. State that method, or learn the players' values with function=value."
         )
 
 

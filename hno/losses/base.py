@@ -33,7 +33,7 @@ class View(NamedTuple):
 
     game: Game
     problem: Problem
-    """What the value function solves the Hamilton-Jacobi equation of: the game, or its `Team` where it is a potential."""
+    """Whose Hamilton-Jacobi equation it is: the game, or its `Team` where a potential is learned."""
     sample: Sample
     """The rows of the term's stream, B of them."""
     field: Field

@@ -44,7 +44,7 @@ class ValueOperator(nn.Module, abc.ABC):
         super().__init__()
         self.game = game
         self.problem: Problem = Team(game) if self.potential else game
-        """What the value function solves the Hamilton-Jacobi equation of."""
+        """Whose Hamilton-Jacobi equation it is: the game, or its `Team` where a potential is learned."""
         functions = 1 if self.potential else game.players
         self.register_buffer("value_scale", torch.tensor(1.0))
         self.register_buffer("costate_scale", torch.ones(functions, game.players, game.state_dim))

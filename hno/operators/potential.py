@@ -27,21 +27,24 @@ MOST = 64
 class PotentialOperator(ValueOperator):
     """The potential W of all players, and every player's value V_i; controls follow from dW / dx_i alone.
 
-    Where the cheapest equilibrium changes from one way around each other to another, W has a ridge. It is the maximum of
-    branches, one for each combination of sides on which pairs of players pass (`hno.data.branches`), and each branch is
-    smooth. One network gives all of them: its branch input is the game's sensors, the sides, and which of W and V_i it is.
+    Where the cheapest equilibrium changes from one way around each other to another, W has a ridge. It is the maximum
+    of branches, one for each combination of sides on which pairs of players pass (`hno.data.branches`), and each branch
+    is smooth. One network gives all of them: its branch input is the game's sensors, the sides, and which of W and V_i
+    it is.
 
     Args:
         game: a potential game.
         network: builds one network for the sizes of its inputs.
-        exact_terminal: W = sum of terminal values + (tau / horizon) N rather than N, so that the boundary condition holds
-            exactly; V_i likewise.
+        exact_terminal: W = sum of terminal values + (tau / horizon) N rather than N, so that the boundary condition
+            holds exactly; V_i likewise.
 
     Raises:
         ValueError: the game is no potential game, or has too many combinations of sides.
     """
 
     potential = True
+    sides: Tensor
+    """Side of every pair in every branch, -1 or 1, (K, pairs)."""
     active: Tensor
     """Whether a label has the branch, (K,)."""
 
@@ -135,7 +138,7 @@ class PotentialOperator(ValueOperator):
         return found[..., 0].masked_fill(~self.active, -torch.inf), found[..., 1:]
 
     def _sensors(self, theta: Tensor) -> Tensor:
-        """Branch inputs of every type, branch and function, the function running fastest, (C, P) -> (C K (1 + P), S)."""
+        """Branch inputs of every type, branch and function, the last running fastest, (C, P) -> (C K (1 + P), S)."""
         game, kinds = self.game, 1 + self.game.players
         each = game.sensors(theta).flatten(-2)[:, None, None]
         sides, kind = self.sides.to(each)[:, None], torch.eye(kinds, dtype=each.dtype, device=each.device)

@@ -51,7 +51,9 @@ def double(sample: Sample) -> Sample:
 
 def training_residuals(operator: ValueOperator, sample: Sample) -> Tensor:
     """What training makes small, through the field and the loss terms of an operator in float64, (rows,)."""
-    view = View(operator.game, operator.problem, sample, operator.field(sample.points), operator.field, operator.scales, 0)
+    view = View(
+        operator.game, operator.problem, sample, operator.field(sample.points), operator.field, operator.scales, 0
+    )
     terms = (losses.get(name)() for name in ("residual", "value", "costate"))
     return torch.cat([(term.residual(view) / term.scale(view)).flatten(1) for term in terms], 1).flatten()
 

@@ -93,7 +93,15 @@ def test_a_boundary_that_holds_exactly_needs_no_points(make_module: MakeModule) 
     module.load_state_dict(free.state_dict())
     operator, batch = module.operator, random_batch(module.operator.game)
     field = operator.field(batch["terminal"].points)
-    view = View(operator.game, operator.problem, batch["terminal"], field, lambda at: operator.field(at, None), operator.scales, 0)
+    view = View(
+        operator.game,
+        operator.problem,
+        batch["terminal"],
+        field,
+        lambda at: operator.field(at, None),
+        operator.scales,
+        0,
+    )
     assert Boundary().residual(view).abs().max() == 0
     assert module.losses(batch).keys() == free.losses(batch).keys() - {"boundary"}
 
