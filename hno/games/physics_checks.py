@@ -138,7 +138,8 @@ def _check_roles(game: Game) -> None:
     for order in (o for o in orders if [game.roles[player] for player in o] == list(game.roles)):
         swapped = Point(at.x[:, order], at.u[:, order], at.costate, at.theta[:, order])
         pairs = {name: (call(game, name, swapped), call(game, name, at)[:, order]) for name in names}
-        pairs["constraint"] = tuple(c.sort().values for c in pairs["constraint"])  # in no particular order
+        after, before = pairs["constraint"]
+        pairs["constraint"] = after.sort().values, before.sort().values  # in no particular order
         for name in ("state_box", "initial_box", "control_box"):
             corners = torch.stack([getattr(game, name).lo, getattr(game, name).hi])
             corners = corners.reshape(2, -1, corners.shape[-1]).expand(2, game.players, -1)
