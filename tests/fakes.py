@@ -8,6 +8,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from hno.control.rollout import Disturbance, Player
+from hno.evaluation.closed_loop import TypeRow, ValueField, collision_table, play
 from hno.games import Game
 from hno.operators import Architecture, Choice
 from hno.pontryagin.mesh import label_times
@@ -83,3 +85,16 @@ def small_architecture(
         Choice("deeponet", {"width": width, "depth": depth}),
         Choice(activation),
     )
+
+
+def played_table(
+    game: Game,
+    policy: Player,
+    labels: Sequence[Extremal],
+    seen: Sequence[Sequence[float]],
+    dt: float = 0.02,
+    disturbance: Disturbance = Disturbance(),
+    field: ValueField | None = None,
+) -> list[TypeRow]:
+    """Play from the starts of labels, and what came of it."""
+    return collision_table(game, labels, play(game, policy, labels, dt, disturbance), seen, 0.02, field)

@@ -17,7 +17,7 @@ from hno.cli.starts import cache_folder
 from hno.data import Collocation, GameData, LabelPlan, make_sampler
 from hno.data.curriculum import Curriculum
 from hno.data.labels import Report
-from hno.evaluation.kernels import check_rows
+from hno.evaluation.ntk import check_rows
 from hno.games import Game, make
 from hno.games.grid import parse_types
 from hno.losses import Objective, make_objective

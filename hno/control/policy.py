@@ -132,16 +132,22 @@ class Feedback(nn.Module, Policy):
     def answer(self, tau: Tensor, x: Tensor, theta: Tensor) -> Answer:
         """Value, costates and controls of one state, (), (P, n), (P,): a pure function without checks.
 
-        `torch.vmap`, `torch.func.jacrev` and `torch.compile` take it.
+        In the floating-point type of `x`. `torch.vmap`, `torch.func.jacrev` and `torch.compile` take it.
         """
-        value, costate = self.operator.value_and_costate(tau, x, theta)
-        return Answer(value, costate, self.operator.problem.optimal_control(x, costate))
+        points = self._cast(tau, x, theta)
+        value, costate = self.operator.value_and_costate(*points)
+        control = self.operator.problem.optimal_control(points.x, costate)
+        return Answer(value.to(x.dtype), costate.to(x.dtype), control.to(x.dtype))
 
     def _points(self, tau: Tensor, x: Tensor, theta: Tensor) -> Points:
-        """The question in the operator's floating-point type."""
-        dtype = self.operator.value_scale.dtype
+        """The question, checked."""
         if self.checked:
             check_question(self.game, tau, x, theta)
+        return self._cast(tau, x, theta)
+
+    def _cast(self, tau: Tensor, x: Tensor, theta: Tensor) -> Points:
+        """The question in the operator's floating-point type."""
+        dtype = self.operator.value_scale.dtype
         return Points(tau.to(dtype), x.to(dtype), theta.to(dtype))
 
 

@@ -100,9 +100,10 @@ def _played(
             x = after
         inside = torch.stack(inner, 1)
         types = theta[:, None, None].expand(inside.shape[:-1])
-        clearance = torch.minimum(clearance, -game.constraint(inside, types).flatten(1).amax(1))
+        constraint = game.constraint(inside, types)
+        clearance = torch.minimum(clearance, -constraint.flatten(1).amax(1))
         distance = torch.minimum(distance, separation(game.positions(inside)).flatten(1).amin(1))
-        rate = torch.trapezoid(game.uncontrolled_cost(inside, types), dx=1 / points, dim=2)
+        rate = torch.trapezoid(game.uncontrolled_cost(inside, types, constraint), dx=1 / points, dim=2)
         value = value - dt * (game.effort(u) + rate.mean(1))
         path.append(x)
         controls.append(u)

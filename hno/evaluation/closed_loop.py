@@ -42,36 +42,10 @@ class TypeRow(NamedTuple):
         return content | content.pop("outcome")._asdict()
 
 
-def collision_table(
-    game: Game,
-    policy: Player,
-    labels: Sequence[Extremal],
-    seen: Sequence[Sequence[float]],
-    clearance: float = 0.02,
-    dt: float = 0.02,
-    disturbance: Disturbance = Disturbance(),
-    field: ValueField | None = None,
-) -> list[TypeRow]:
-    """Play from the start states of labels and compare.
-
-    Args:
-        game: the game.
-        policy: feedback controls of all players.
-        labels: one set per type.
-        seen: types that the operator was trained with.
-        clearance: what the label must keep for its start to count, in the unit of the game's constraint.
-        dt: time for which a control is held, s.
-        disturbance: of the episodes.
-        field: the policy's value function, if it has one.
-    """
-    played = play(game, policy, labels, dt, disturbance)
-    return [type_row(game, *sets, seen, clearance, field) for sets in zip(labels, played, strict=True)]
-
-
 def play(
     game: Game, policy: Player, labels: Sequence[Extremal], dt: float, disturbance: Disturbance = Disturbance()
 ) -> list[Trajectory]:
-    """Episodes from the start states of labels, one set per set of labels. See `collision_table`."""
+    """Episodes from the start states of labels, one set per set of labels, with controls held for `dt`, s."""
     starts = torch.cat([found.x[:, 0] for found in labels]).float()
     types = torch.cat([found.theta for found in labels]).float()
     played = rollout(game, policy, starts, types, dt, disturbance=disturbance)
@@ -80,25 +54,33 @@ def play(
     return [Trajectory(played.t, *part) for part in columns]
 
 
-def type_row(
+def collision_table(
     game: Game,
-    labels: Extremal,
-    played: Trajectory,
+    labels: Sequence[Extremal],
+    played: Sequence[Trajectory],
     seen: Sequence[Sequence[float]],
     clearance: float,
     field: ValueField | None = None,
-) -> TypeRow:
-    """The line of one type, from labels and the episodes from their starts. See `collision_table`."""
-    theta, known = tuple(labels.theta[0].tolist()), [tuple(map(float, types)) for types in seen]
-    inside = (min(column) <= t <= max(column) for t, column in zip(theta, zip(*known, strict=True), strict=False))
-    return TypeRow(
-        theta,
-        theta in known,
-        not bool(game.type_box.contains(labels.theta[0].to(game.type_box.lo))),
-        not all(inside),
-        outcome(game, labels, played, clearance),
-        *((None, None) if field is None else label_errors(game, field, labels)),
-    )
+) -> list[TypeRow]:
+    """What came of the episodes from the starts of labels, type by type.
+
+    Args:
+        game: the game.
+        labels: one set per type.
+        played: episodes from their starts, see `play`.
+        seen: types that the operator was trained with.
+        clearance: what the label must keep for its start to count, in the unit of the game's constraint.
+        field: the policy's value function, if it has one.
+    """
+    known, box, rows = [tuple(map(float, types)) for types in seen], game.type_box, list[TypeRow]()
+    for found, episodes in zip(labels, played, strict=True):
+        theta = tuple(found.theta[0].tolist())
+        extrapolated = not bool(box.contains(found.theta[0].to(box.lo)))
+        outside = any(not min(c) <= t <= max(c) for t, *c in zip(theta, *known, strict=True)) if known else False
+        errors = label_errors(game, field, found) if field else (None, None)
+        flags = theta in known, extrapolated, outside
+        rows.append(TypeRow(theta, *flags, outcome(game, found, episodes, clearance), *errors))
+    return rows
 
 
 def label_errors(game: Game, field: ValueField, found: Extremal) -> tuple[float | None, float | None]:
@@ -141,8 +123,8 @@ class CollisionTable(ModelSection):
     def compute(self, evaluation: Evaluation) -> list[dict[str, Any]]:
         """One line per type."""
         seen, clearance, field = evaluation.seen, evaluation.clearance, evaluation.policy.operator.field
-        sets = zip(evaluation.labels, evaluation.played, strict=True)
-        return [type_row(evaluation.game, *pair, seen, clearance, field).content() for pair in sets]
+        rows = collision_table(evaluation.game, evaluation.labels, evaluation.played, seen, clearance, field)
+        return [row.content() for row in rows]
 
     def rows(self, content: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         """One line per type, with entries that belong together in one column."""
@@ -164,15 +146,15 @@ class CollisionTable(ModelSection):
         keeps = f"{results['clearance']:g} {results['constraint_unit']}".strip()
         said = [verdict(content)]
         said += [
-            f"No rate (n/a) at {_at(row)}: of {row['starts']} starts none has an equilibrium that keeps {keeps}; "
-            f"{row['unsolved']} unsolved, {row['inevitable']} inevitable, {row['marginal']} marginal."
+            f"No rate (n/a) at {text.at(row['theta'])}: of {row['starts']} starts none has an equilibrium that keeps "
+            f"{keeps}; {row['unsolved']} unsolved, {row['inevitable']} inevitable, {row['marginal']} marginal."
             for row in content
             if row["rate"] is None
         ]
-        outside = [_at(row) for row in content if row["extrapolated"]]
+        outside = [text.at(row["theta"]) for row in content if row["extrapolated"]]
         if outside:
             said.append(f"Outside the types that the game is made for, results extrapolate: {', '.join(outside)}.")
-        beyond = [_at(row) for row in content if row["outside_seen"]]
+        beyond = [text.at(row["theta"]) for row in content if row["outside_seen"]]
         if beyond:
             counts = f"{len(beyond)} of {text.counted(len(content), 'type')}"
             said.append(f"{counts} lie outside the box around the trained ones: {', '.join(beyond)}.")
@@ -187,9 +169,5 @@ def verdict(rows: Sequence[Mapping[str, Any]]) -> str:
     collisions, starts = text.counted(whole.collisions, "collision"), text.counted(whole.safe_starts, "safe start")
     worst = ""
     if whole.worst_theta is not None:
-        worst = f"; worst {text.percent(whole.worst_rate)} at ({text.types(whole.worst_theta)})"
+        worst = f"; worst {text.percent(whole.worst_rate)} at {text.at(whole.worst_theta)}"
     return f"{collisions} in {starts} ({text.percent(whole.rate)}){worst}."
-
-
-def _at(row: Mapping[str, Any]) -> str:
-    return f"({text.types(row['theta'])})"

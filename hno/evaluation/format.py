@@ -64,6 +64,11 @@ def types(theta: Iterable[float] | None) -> str:
     return "all" if theta is None else ", ".join(f"{entry:g}" for entry in theta)
 
 
+def at(theta: Iterable[float]) -> str:
+    """Where something was: player types."""
+    return f"({types(theta)})"
+
+
 def counted(count: int, noun: str) -> str:
     """A number of things."""
     return f"{count:,} {noun}{'' if count == 1 else 's'}"

@@ -12,27 +12,20 @@ from hno.games import Box
 
 
 def quantiles(values: Tensor, shares: Sequence[float]) -> Tensor:
-    """Quantiles of numbers (B,), each one of them, the lower of two neighbours: float64, (shares,).
+    """Quantiles of numbers (B, ...), each one of them, the lower of two neighbours: float64, (shares, ...).
 
     NaN without any number, or with a NaN among them.
     """
     at = torch.tensor(shares, dtype=torch.float64, device=values.device)
     if len(values) == 0:
-        return torch.full_like(at, torch.nan)
-    return values.double().quantile(at, interpolation="lower")
+        return at.new_full((len(shares), *values.shape[1:]), torch.nan)
+    return values.double().quantile(at, 0, interpolation="lower")
 
 
 def saturated_share(u: Tensor, box: Box, tolerance: float = 1e-4) -> float | None:
     """Share of controls (B, K, P, m) within `tolerance` widths of a bound of their box; None without controls."""
     inside = torch.minimum(u - box.lo, box.hi - u) / box.width
     return float((inside <= tolerance).double().mean()) if inside.numel() else None
-
-
-def binned_mean(values: Tensor, place: Tensor, bins: int) -> Tensor:
-    """Mean of absolute values (B, ...) by the bin of each row, `place` (B,): float64, (bins,); NaN if empty."""
-    rows = values.abs().double().flatten(1)
-    total = torch.zeros(bins, dtype=torch.float64, device=rows.device).index_add(0, place, rows.sum(-1))
-    return total / (rows.shape[-1] * torch.bincount(place, minlength=bins))
 
 
 def clopper_pearson(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float] | None:

@@ -14,7 +14,7 @@ from hno.data.certificates import CLEARANCE, safe
 from hno.evaluation import format as text
 from hno.evaluation.closed_loop import play
 from hno.evaluation.latency import latency
-from hno.evaluation.outcome import outcome, together
+from hno.evaluation.outcome import Outcome, outcomes
 from hno.evaluation.sections import COUNTS, Column, Evaluation, ModelSection, sections
 from hno.games import Game
 from hno.types import Extremal, part
@@ -59,20 +59,19 @@ def compare(
         One line per type and a last one, of theta None, for all of them: the `Outcome` of each of `CONTROLLERS`, and
         the counts of `SOLVES`.
     """
-    solver = RecedingHorizon(game, interval)
-    learned, online = (play(game, controller, labels, dt, disturbance) for controller in (policy, solver))
-    rows = torch.arange(len(solver.solves)).split([len(found.status) for found in labels])
-    sets = list(zip(labels, learned, online, rows, strict=True))
-    whole, ours = together(labels, learned)
-    sets.append((whole, ours, together(labels, online)[1], torch.cat(rows)))
+    solver, found = RecedingHorizon(game, interval), dict[str, list[Outcome]]()
+    for name, controller in (("policy", policy), ("solver", solver)):
+        by_type, whole = outcomes(game, labels, play(game, controller, labels, dt, disturbance), clearance)
+        found[name] = [*by_type, whole]
+    rows = torch.arange(len(solver.solves))
+    sets = [*rows.split([len(one.status) for one in labels]), rows]
     return [
         {
             "theta": None if theta is None else tuple(map(float, theta)),
-            "policy": outcome(game, found, played, clearance)._asdict(),
-            "solver": outcome(game, found, solved, clearance)._asdict(),
-            "solves": {name: int(getattr(solver, name)[index].sum()) for name in SOLVES},
+            **{name: results[place]._asdict() for name, results in found.items()},
+            "solves": {name: int(getattr(solver, name)[sets[place]].sum()) for name in SOLVES},
         }
-        for theta, (found, played, solved, index) in zip([*types, None], sets, strict=True)
+        for place, theta in enumerate([*types, None])
     ]
 
 

@@ -66,8 +66,8 @@ def outcome(game: Game, labels: Extremal, played: Trajectory, clearance: float) 
     """
     counted, near = safe(labels, clearance), marginal(labels, clearance)
     count, collisions = int(counted.sum()), int((played.collided & counted).sum())
-    excess = (labels.value[:, 0] - played.value.double())[counted]
-    distances = _finite(quantiles(played.distance[counted], SHARES))
+    own = (labels.value[:, 0] - played.value.double())[counted]
+    joint, distances = quantiles(own.sum(-1), (0.5, 1)), _finite(quantiles(played.distance[counted], SHARES))
     return Outcome(
         starts=len(labels.status),
         unsolved=int((labels.status != Status.CONVERGED).sum()),
@@ -80,32 +80,29 @@ def outcome(game: Game, labels: Extremal, played: Trajectory, clearance: float) 
         interval=clopper_pearson(collisions, count),
         median_min_distance=None if distances is None else distances[-1],
         distance_quantiles=distances,
-        median_excess_cost=_median(excess.sum(-1)),
-        largest_excess_cost=_single(excess.sum(-1).max()) if count else None,
-        median_excess_costs=_finite(excess.median(0).values) if count else None,
-        median_label_cost=_median(labels.cost[counted]),
+        median_excess_cost=_finite(joint[0]),
+        largest_excess_cost=_finite(joint[1]),
+        median_excess_costs=_finite(quantiles(own, (0.5,))[0]),
+        median_label_cost=_finite(quantiles(labels.cost[counted], (0.5,))[0]),
         saturated=saturated_share(played.u[counted], game.control_box),
     )
 
 
-def together(labels: Sequence[Extremal], played: Sequence[Trajectory]) -> tuple[Extremal, Trajectory]:
-    """Labels and episodes of several types as one set."""
+def outcomes(
+    game: Game, labels: Sequence[Extremal], played: Sequence[Trajectory], clearance: float
+) -> tuple[list[Outcome], Outcome]:
+    """What came of the episodes of every type, and of all of them together."""
     columns = zip(*(episodes[1:] for episodes in played), strict=True)
-    return join(labels), Trajectory(played[0].t, *(torch.cat(column) for column in columns))
+    whole = Trajectory(played[0].t, *(torch.cat(column) for column in columns))
+    by_type = [outcome(game, *sets, clearance) for sets in zip(labels, played, strict=True)]
+    return by_type, outcome(game, join(labels), whole, clearance)
 
 
-def _median(values: Tensor) -> float | None:
-    """The lower median; None without numbers, or where it is not finite."""
-    return _single(values.median()) if len(values) else None
-
-
-def _single(value: Tensor) -> float | None:
-    return float(value) if bool(value.isfinite()) else None
-
-
-def _finite(values: Tensor) -> tuple[float, ...] | None:
-    """Numbers as they are stored, (N,); None if one is not finite."""
-    return tuple(values.tolist()) if bool(values.isfinite().all()) else None
+def _finite(values: Tensor) -> Any:
+    """A number, or a tuple of them; None if one is not finite."""
+    if not bool(values.isfinite().all()):
+        return None
+    return tuple(values.tolist()) if values.dim() else float(values)
 
 
 class Pooled(NamedTuple):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -11,10 +12,8 @@ from torch import Tensor
 from hno.data.rows import rows_of
 from hno.data.sources import Known, Pool, make_sampler, sample_points
 from hno.evaluation import format as text
-from hno.evaluation.metrics import binned_mean
 from hno.evaluation.sections import Column, Evaluation, ModelSection, sections
 from hno.games import Game
-from hno.losses import View
 from hno.losses.hji import HJIResidual
 from hno.operators import ValueOperator
 from hno.types import Extremal, Points, Sample, Status
@@ -70,12 +69,11 @@ def residual_table(
         bins: of time to go.
     """
     known = {tuple(map(float, theta)) for theta in seen}
-    rows = list[ResidualRow]()
-    for found in labels:
-        theta = tuple(found.theta[0].tolist())
-        for region, where in zip(REGIONS, _regions(operator.game, found, points, seed), strict=True):
-            rows.append(ResidualRow(theta, theta in known, region, len(where.tau), *_means(operator, where, bins)))
-    return rows
+    return [
+        ResidualRow(theta, theta in known, region, len(where.tau), *_means(operator, where, bins))
+        for found, theta in ((found, tuple(found.theta[0].tolist())) for found in labels)
+        for region, where in zip(REGIONS, _regions(operator.game, found, points, seed), strict=True)
+    ]
 
 
 def _regions(game: Game, found: Extremal, size: int, seed: int) -> Iterator[Points]:
@@ -95,8 +93,7 @@ def _regions(game: Game, found: Extremal, size: int, seed: int) -> Iterator[Poin
         yield sampled("labels", Pool(nodes.tau, nodes.x))
         yield nodes
     else:
-        nothing = Points(types[:0, 0], found.x[:0, 0].float(), types[:0])
-        yield from (nothing, nothing)
+        yield from [Points(types[:0, 0], found.x[:0, 0].float(), types[:0])] * 2
 
 
 def _means(operator: ValueOperator, where: Points, bins: int) -> tuple[Any, ...]:
@@ -104,29 +101,28 @@ def _means(operator: ValueOperator, where: Points, bins: int) -> tuple[Any, ...]
     horizon = operator.game.horizon
     place = (where.tau / horizon * bins).long().clamp(0, bins - 1)
     residual, scale = hji(operator, where) if len(where.tau) > 0 else (where.theta, where.theta)
+    inside = [place == k for k in range(bins)]
     kinds = residual, residual / scale
     return (
-        *(_numbers(kind.abs().double().mean()) for kind in kinds),
+        *map(_mean, kinds),
         tuple(horizon * k / bins for k in range(bins + 1)),
-        tuple(torch.bincount(place, minlength=bins).tolist()),
-        *(_numbers(binned_mean(kind, place, bins)) for kind in kinds),
+        tuple(int(rows.sum()) for rows in inside),
+        *(tuple(_mean(kind[rows]) for rows in inside) for kind in kinds),
     )
+
+
+def _mean(values: Tensor) -> float | None:
+    """Mean of absolute values; None without any, or where one is no number."""
+    found = float(values.abs().double().mean())
+    return None if math.isnan(found) else found
 
 
 @torch.no_grad()
 def hji(operator: ValueOperator, points: Points) -> tuple[Tensor, Tensor]:
     """The HJI residual, 1/s, and the size that the loss measures it in, both (B, P)."""
-    term, field = HJIResidual(), operator.field(points)
-    view = View(operator.game, operator.problem, Sample(points), field, operator.field, operator.scales, 0)
+    term, view = HJIResidual(), operator.view(Sample(points), operator.field(points))
     residual = term.residual(view)
     return residual, term.scale(view).expand_as(residual)
-
-
-def _numbers(values: Tensor) -> Any:
-    """A number, or a tuple of them, with None for NaN."""
-    if values.dim():
-        return tuple(map(_numbers, values))
-    return None if bool(values.isnan()) else float(values)
 
 
 @sections.register("residuals")
@@ -150,15 +146,13 @@ class Residuals(ModelSection):
     def compute(self, evaluation: Evaluation) -> list[dict[str, Any]]:
         """One line per type and region."""
         operator, seed = evaluation.policy.operator, evaluation.options["seed"]
-        rows = residual_table(operator, evaluation.labels, evaluation.seen, seed=seed)
-        return [row._asdict() for row in rows]
+        return [row._asdict() for row in residual_table(operator, evaluation.labels, evaluation.seen, seed=seed)]
 
     def rows(self, content: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         """One line per region for the seen types and one for the unseen ones."""
-        regions = list(dict.fromkeys(row["region"] for row in content))
-        groups = [(region, seen) for region in regions for seen in (True, False)]
-        found = [(*group, [row for row in content if (row["region"], row["seen"]) == group]) for group in groups]
-        return [_together(*group) for group in found if group[-1]]
+        groups = dict.fromkeys((row["region"], seen) for row in content for seen in (True, False))
+        found = {group: [row for row in content if (row["region"], row["seen"]) == group] for group in groups}
+        return [_together(*group, rows) for group, rows in found.items() if rows]
 
 
 def _together(region: str, seen: bool, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -6,43 +6,14 @@ import logging
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from hno.control.rollout import Player
 from hno.data.labels import interchangeable
 from hno.evaluation import format as text
 from hno.evaluation.closed_loop import play
 from hno.evaluation.conditions import Condition, read_conditions
-from hno.evaluation.outcome import outcome, pooled, together
+from hno.evaluation.outcome import outcomes, pooled
 from hno.evaluation.sections import COUNTS, Column, Evaluation, ModelSection, sections
-from hno.games import Game
-from hno.types import Extremal
 
 log = logging.getLogger(__name__)
-
-
-def robustness_row(
-    game: Game, policy: Player, condition: Condition, labels: Sequence[Extremal], clearance: float, dt: float
-) -> dict[str, Any]:
-    """What comes of a policy from the starts of labels under a condition.
-
-    Args:
-        game: the game.
-        policy: feedback controls of all players.
-        condition: of the episodes.
-        labels: where episodes begin and what their equilibria cost, one set per type.
-        clearance: what the label must keep for its start to count, in the unit of the game's constraint.
-        dt: time for which a control is held, s.
-
-    Returns:
-        The condition, the `Outcome` of all types together, and "types": safe starts and collisions of each.
-    """
-    played = play(game, policy, labels, dt, condition.disturbance)
-    by_type = [outcome(game, *sets, clearance) for sets in zip(labels, played, strict=True)]
-    types = [
-        {"theta": tuple(found.theta[0].tolist()), "safe_starts": one.safe_starts, "collisions": one.collisions}
-        for found, one in zip(labels, by_type, strict=True)
-    ]
-    whole = outcome(game, *together(labels, played), clearance)
-    return {"name": condition.name, "condition": condition.entries(), **whole._asdict(), "types": types}
 
 
 @sections.register("robustness")
@@ -63,14 +34,24 @@ class Robustness(ModelSection):
         conditions_of(evaluation)
 
     def compute(self, evaluation: Evaluation) -> list[dict[str, Any]]:
-        """One line per condition; that of symmetric starts is left out where players differ in their roles."""
+        """The condition, the `Outcome` of all types together and counts by type, one line per condition.
+
+        Symmetric starts are left out where players differ in their roles.
+        """
         game, rows = evaluation.game, []
         for condition in conditions_of(evaluation):
             if condition.symmetric and not interchangeable(game):
                 log.info("Condition %s is left out: the players of this game are not interchangeable.", condition.name)
                 continue
-            settings = evaluation.solve(condition), evaluation.clearance, evaluation.dt
-            rows.append(robustness_row(game, evaluation.policy, condition, *settings))
+            labels = evaluation.solve(condition)
+            played = play(game, evaluation.policy, labels, evaluation.dt, condition.disturbance)
+            by_type, whole = outcomes(game, labels, played, evaluation.clearance)
+            types = [
+                {"theta": theta, "safe_starts": one.safe_starts, "collisions": one.collisions}
+                for theta, one in zip(evaluation.types, by_type, strict=True)
+            ]
+            names = {"name": condition.name, "condition": condition.entries()}
+            rows.append({**names, **whole._asdict(), "types": types})
         return rows
 
     def rows(self, content: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -92,4 +73,4 @@ def _worst(rows: Sequence[Mapping[str, Any]]) -> str | None:
     if theta is None:
         return "none" if any(row["safe_starts"] for row in rows) else None
     worst = next(row for row in rows if tuple(row["theta"]) == theta)
-    return f"{worst['collisions']} of {worst['safe_starts']} at ({text.types(theta)})"
+    return f"{worst['collisions']} of {worst['safe_starts']} at {text.at(theta)}"

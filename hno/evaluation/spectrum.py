@@ -79,14 +79,13 @@ def condition_ratio(over: Summary | None, under: Summary | None) -> Ratio:
     """Condition number of one matrix over that of another; a bound where one of them is cut off."""
     if over is None or under is None or not (over["rank"] and under["rank"]):
         return Ratio(None, "n/a")
-    whole = over["rank"] == over["rows"], under["rank"] == under["rows"]
-    bound = {(True, True): "=", (False, True): ">", (True, False): "<"}.get(whole)
-    if bound is None:
+    cut = [one["rank"] < one["rows"] for one in (over, under)]
+    if all(cut):
         return Ratio(None, "n/a")
     large, small = (
-        one["condition"] if known else 1 / one["cutoff"] for one, known in zip((over, under), whole, strict=True)
+        1 / one["cutoff"] if is_cut else one["condition"] for one, is_cut in zip((over, under), cut, strict=True)
     )
-    return Ratio(large / small, bound)
+    return Ratio(large / small, ">" if cut[0] else "<" if cut[1] else "=")
 
 
 def condition_ratios(results: Mapping[str, Sequence[Mapping[str, Any]]], over: str = "tanh") -> list[dict[str, Any]]:
@@ -111,16 +110,16 @@ def condition_ratios(results: Mapping[str, Sequence[Mapping[str, Any]]], over: s
     common = [theta for theta in sections[over] if all(theta in section for section in sections.values())]
     if not common:
         raise ValueError(f"The sections {', '.join(results)} have no player type in common: evaluate the same types.")
-    return [_ratios(theta, {name: section[theta] for name, section in sections.items()}, over) for theta in common]
-
-
-def _ratios(theta: tuple[float, ...], entries: Mapping[str, Mapping[str, Any]], over: str) -> dict[str, Any]:
-    points = {name: entry["points"] for name, entry in entries.items()}
-    if len(set(points.values())) > 1:
-        raise ValueError(
-            f"Kernels of different numbers of points do not compare; at theta = {theta} these are {points}."
-        )
-    return {"theta": list(theta)} | {
-        kind: {name: condition_ratio(entries[over][kind], one[kind]) for name, one in entries.items() if name != over}
-        for kind in ("kernel", "product")
-    }
+    found = list[dict[str, Any]]()
+    for theta in common:
+        entries = {name: section[theta] for name, section in sections.items()}
+        points = {name: entry["points"] for name, entry in entries.items()}
+        if len(set(points.values())) > 1:
+            raise ValueError(f"Kernels of different numbers of points do not compare; at theta = {theta}: {points}.")
+        first = entries.pop(over)
+        ratios = {
+            kind: {name: condition_ratio(first[kind], other[kind]) for name, other in entries.items()}
+            for kind in ("kernel", "product")
+        }
+        found.append({"theta": list(theta), **ratios})
+    return found

@@ -178,9 +178,11 @@ class Game(FinalMethods, nn.Module, abc.ABC):
         """Number of controls per player m."""
         return self.control_box.lo.shape[-1]
 
-    def uncontrolled_cost(self, x: Tensor, theta: Tensor) -> Tensor:
-        """The running cost without the effort, 1/s, (B, P)."""
-        return self.state_cost(x, theta) + self.penalty(x, theta)
+    def uncontrolled_cost(self, x: Tensor, theta: Tensor, constraint: Tensor | None = None) -> Tensor:
+        """The running cost without the effort, 1/s, (B, P); who knows the constraint at `x` gives it."""
+        if constraint is None or self.overrides("penalty"):
+            return self.state_cost(x, theta) + self.penalty(x, theta)
+        return self.state_cost(x, theta) + self.soft_constraint(constraint).sum(-1)
 
     def running_cost(self, x: Tensor, u: Tensor, theta: Tensor) -> Tensor:
         """Effort, state cost and penalty, 1/s, (B, P)."""

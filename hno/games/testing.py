@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
 from hno.games.base import REQUIRED, Game
-from hno.games.physics_checks import check_control_box, check_physics
-from hno.games.probe import ContractError, Point, methods, points, require
+from hno.games.physics_checks import (
+    METHODS,
+    ContractError,
+    Point,
+    call,
+    check_control_box,
+    check_physics,
+    points,
+    require,
+)
 
 __all__ = ["ContractError", "check_game"]
 
@@ -25,7 +32,7 @@ def check_game(game: Game) -> None:
         ContractError: the first promise that the game breaks.
     """
     game = copy.deepcopy(game)
-    for check in (_check_attributes, _check_box_shapes, _check_box_edges, _check_horizon, _check_periods):
+    for check in (_check_attributes, _check_box_shapes, _check_box_edges, _check_places):
         check(game)
     for dtype in (torch.float32, torch.float64):
         for check_dtype in (_check_outputs, _check_derivatives, check_control_box):
@@ -43,93 +50,80 @@ def _check_attributes(game: Game) -> None:
 
 
 def _check_box_shapes(game: Game) -> None:
+    remedy = "Boxes have one row per entry of `roles`; control_box may be that of one player, if all have the same."
     joint, own = (game.players, game.state_dim), (game.players, game.control_dim)
-    one_for_all = game.control_box.lo.dim() == 1
-    shapes = {
-        "state_box": joint,
-        "initial_box": joint,
-        "control_box": own[1:] if one_for_all else own,
-        "type_box": joint[:1],
-    }
+    controls = own[1:] if game.control_box.lo.dim() == 1 else own
+    shapes = {"state_box": joint, "initial_box": joint, "control_box": controls, "type_box": joint[:1]}
     for name, shape in shapes.items():
         box = getattr(game, name)
-        remedy = "Boxes have one row per entry of `roles`; control_box may be that of one player, if all have the same."
-        require(tuple(box.lo.shape) == shape, f"{name} of shape {shape}", tuple(box.lo.shape), remedy)
-        finite = bool(box.width.isfinite().all())
-        require(finite, f"finite corners of {name}", [box.lo.tolist(), box.hi.tolist()], "State its limits.")
+        require(box.lo.shape == shape, f"{name} of shape {shape}", tuple(box.lo.shape), remedy)
+        corners = [box.lo.tolist(), box.hi.tolist()]
+        require(box.width.isfinite().all(), f"finite corners of {name}", corners, "State its limits.")
 
 
 def _check_box_edges(game: Game) -> None:
-    outer, inner = game.state_box, game.initial_box
-    for name, box in (("state_box", outer), ("control_box", game.control_box), ("type_box", game.type_box)):
-        require(bool((box.width > 0).all()), f"positive edges of {name}", box.width.tolist(), "They are divided by.")
-    inside, corners = bool(outer.contains(inner.lo) & outer.contains(inner.hi)), [inner.lo.tolist(), inner.hi.tolist()]
-    require(inside, "initial_box inside state_box", corners, "Widen state_box until every episode starts in it.")
+    for name in ("state_box", "control_box", "type_box"):
+        width = getattr(game, name).width
+        require((width > 0).all(), f"positive edges of {name}", width.tolist(), "They are divided by.")
+    corners = torch.stack([game.initial_box.lo, game.initial_box.hi])
+    inside, remedy = game.state_box.contains(corners).all(), "Widen state_box until every episode starts in it."
+    require(inside, "initial_box inside state_box", corners.tolist(), remedy)
 
 
-def _check_horizon(game: Game) -> None:
+def _check_places(game: Game) -> None:
     steps = game.horizon / game.label_step if game.label_step > 0 else 0.0
-    whole = steps > 0.5 and abs(steps - round(steps)) < 1e-6
-    got = f"horizon {game.horizon} s, label_step {game.label_step} s"
-    require(whole, "a horizon that is a whole multiple of label_step", got, "Change one of them.")
-
-
-def _check_periods(game: Game) -> None:
+    whole, got = abs(steps - round(steps)) < 1e-6, f"horizon {game.horizon} s, label_step {game.label_step} s"
+    require(whole and steps > 0.5, "a horizon that is a whole multiple of label_step", got, "Change one of them.")
     known, places = all(place in range(game.state_dim) for place in game.periodic), f"0 to {game.state_dim - 1}"
     require(known, f"places {places} in `periodic`", game.periodic, "They are places in a player's own state.")
 
 
 def _check_outputs(game: Game, dtype: torch.dtype) -> None:
     for shape in ((), (2,), (2, 3)):
-        for name, (method, tail) in methods(game, points(game, shape, dtype)).items():
-            output = _call(name, method, shape, dtype)
-            last = output.shape[-1] if output.dim() > 0 else 0
-            some = (max(1, last),)
-            free = {"sensors": some, "constraint": some, "positions": (3 if last == 3 else 2,)}.get(name, ())
-            _require_output(name, output, (*shape, *tail, *free), torch.bool if name == "violates" else dtype)
+        at = points(game, shape, dtype)
+        for name in METHODS:
+            try:
+                output = call(game, name, at)
+            except (RuntimeError, TypeError, ValueError, IndexError) as error:
+                raise ContractError(
+                    f"Expected {name} to accept batch shape {shape} in {dtype}; got {type(error).__name__}: {error}. "
+                    "Index the last axes (x[..., i, :]), and register constant tensors as buffers, so that they follow "
+                    "the game's dtype."
+                ) from error
+            _require_output(game, name, output, shape, dtype)
 
 
-def _call(name: str, method: Callable[[], Tensor], shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
-    try:
-        return method()
-    except (RuntimeError, TypeError, ValueError, IndexError) as error:
-        raise ContractError(
-            f"Expected {name} to accept batch shape {shape} in {dtype}; got {type(error).__name__}: {error}. Index the "
-            "last axes (x[..., i, :]), and register constant tensors as buffers, so that they follow the game's dtype."
-        ) from error
-
-
-def _require_output(name: str, output: Tensor, shape: tuple[int, ...], dtype: torch.dtype) -> None:
+def _require_output(game: Game, name: str, output: Tensor, batch: tuple[int, ...], dtype: torch.dtype) -> None:
+    last = output.shape[-1] if output.dim() > 0 else 0
+    some = (max(1, last),)
+    free = {"sensors": some, "constraint": some, "positions": (3 if last == 3 else 2,)}.get(name, ())
+    shape = (*batch, *(getattr(game, size) for size in METHODS[name][1].split()), *free)
     remedy = "Index the last axes (x[..., i, :]) and stack on them; see hno.types for the shapes."
-    require(tuple(output.shape) == shape, f"{name} of shape {shape}", tuple(output.shape), remedy)
+    require(output.shape == shape, f"{name} of shape {shape}", tuple(output.shape), remedy)
     remedy = "Register constant tensors as buffers and build new ones with the dtype of an argument."
     require(output.dtype == dtype, f"{name} of {dtype} in a game and at points of that kind", output.dtype, remedy)
-    finite = bool(output.isfinite().all())
-    require(finite, f"finite {name} in state_box", output.tolist(), "Guard divisions, roots and logarithms.")
+    remedy = "Guard divisions, roots and logarithms."
+    require(output.isfinite().all(), f"finite {name} in state_box", output.tolist(), remedy)
 
 
 def _check_derivatives(game: Game, dtype: torch.dtype) -> None:
     at = points(game, (4,), dtype)
-    centre, still = (((box.lo + box.hi) / 2) for box in (game.state_box, game.control_box))
+    centre, still = ((box.lo + box.hi) / 2 for box in (game.state_box, game.control_box))
     places = {
         "in state_box": at,
         "where the players' positions coincide": at._replace(x=_contact(game, at.x)),
         "where the players' states are equal": at._replace(x=at.x[:, :1].expand_as(at.x)),
         "at the centres of the boxes": at._replace(x=centre.expand_as(at.x), u=still.expand_as(at.u)),
     }
+    remedy = "Round the tips of norms and roots, as hno.games.kinematics.distances does; avoid 0 * inf in branches."
     for where, point in places.items():
         inputs = Point(*(part.detach().clone().requires_grad_() for part in point))
-        for name in ("dynamics", "effort", "terminal_value", "constraint", "running_cost", "best_response"):
-            _require_smooth(name, methods(game, inputs)[name][0](), inputs, where)
-
-
-def _require_smooth(name: str, output: Tensor, inputs: Point, where: str) -> None:
-    remedy = "Round the tips of norms and roots, as hno.games.kinematics.distances does; avoid 0 * inf in branches."
-    first = _gradients(output, inputs)
-    second = [] if name == "best_response" else [s for f in first for s in _gradients(f, inputs)]
-    for order, gradients in (("first", first), ("second", second)):
-        finite = all(bool(gradient.isfinite().all()) for gradient in gradients)
-        require(finite, f"finite {order} derivatives of {name} {where}", "NaN or infinity", remedy)
+        for name in (name for name in METHODS if name not in ("sensors", "positions")):
+            first = _gradients(call(game, name, inputs), inputs)
+            second = [] if name == "best_response" else [s for f in first for s in _gradients(f, inputs)]
+            for order, gradients in (("first", first), ("second", second)):
+                finite = all(bool(gradient.isfinite().all()) for gradient in gradients)
+                require(finite, f"finite {order} derivatives of {name} {where}", "NaN or infinity", remedy)
 
 
 def _gradients(output: Tensor, inputs: Point) -> list[Tensor]:
@@ -149,9 +143,11 @@ def _contact(game: Game, x: Tensor) -> Tensor:
     def gaps(state: Tensor) -> Tensor:
         return game.positions(state).diff(dim=-2).flatten()
 
+    def step(state: Tensor) -> Tensor:
+        slope = torch.autograd.functional.jacobian(gaps, state).flatten(1)
+        return state - (torch.linalg.pinv(slope) @ gaps(state)).view_as(state)
+
     states = list((64 * x).round() / 64)
     for _ in range(3 if game.players > 1 else 0):
-        inverses = [torch.linalg.pinv(torch.autograd.functional.jacobian(gaps, s).flatten(1)) for s in states]
-        moved = [s - (inverse @ gaps(s)).view_as(s) for s, inverse in zip(states, inverses, strict=True)]
-        states = [(1024 * s).round() / 1024 for s in moved]
+        states = [(1024 * step(state)).round() / 1024 for state in states]
     return torch.stack(states)

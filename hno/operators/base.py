@@ -11,9 +11,9 @@ from torch import Tensor, nn
 
 from hno.games import Game
 from hno.games.potential import Problem, Team
-from hno.losses import Scales
+from hno.losses import Scales, View
 from hno.registry import Registry
-from hno.types import Field, Points, Types
+from hno.types import Field, Points, Sample, Types
 
 operators: Registry[Any] = Registry("operator", "hno.operators")
 """Subclasses of `ValueOperator`."""
@@ -79,6 +79,10 @@ class ValueOperator(nn.Module, abc.ABC):
     def forward(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
         """The value."""
         return self.value(tau, x, theta)
+
+    def view(self, sample: Sample, field: Field, at: Callable[[Points], Field] | None = None, step: int = 0) -> View:
+        """What a loss term sees of the operator, whose field at the sample is given; `at` is `field` by default."""
+        return View(self.game, self.problem, sample, field, at or self.field, self.scales, step)
 
     def compile_kernels(self) -> None:
         """Train through `torch.compile`, where the operator knows how; it pays in long runs."""

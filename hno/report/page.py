@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,6 @@ from hno.evaluation import format as text
 from hno.evaluation.sections import plain
 from hno.report import page_data, vega, verdicts
 from hno.report.charts import specifications
-from hno.report.palette import DARK, FONT, LIGHT, Palette, chart_config, signals
 from hno.report.recipes import Recipe, best, headline, recipes
 from hno.report.records import Run
 from hno.report.runs import Sweep
@@ -34,7 +33,6 @@ from hno.report.tables import (
 
 EPISODES = 400
 """Episodes of a page, at most."""
-THEMES: Mapping[str, Palette] = {"light": LIGHT, "dark": DARK}
 FILTERS = ("game", "operator", "activation", "seed")
 
 
@@ -55,7 +53,7 @@ def render(sweep: Sweep, refresh: float | None = None) -> str:
         "curves": curves,
         "episodes": [page_data.playable(run, one) for run, one in played[:EPISODES]],
         "charts": specifications(),
-        "themes": {name: {"config": chart_config(name), "signals": signals(one)} for name, one in THEMES.items()},
+        "themes": {name: {"config": vega.chart_config(name), "signals": vega.signals(name)} for name in vega.THEMES},
         "refresh": refresh,
     }
     common, differing = _settings(runs, found)
@@ -72,7 +70,7 @@ def render(sweep: Sweep, refresh: float | None = None) -> str:
         curve_games=sorted({entry["game"] for entry in curves}), recipe_table=recipe_table(found),
         run_table=run_table(runs), labels=label_tables(runs), sections=[entry for entry in sections if entry[1]],
         common=common, differing=differing, cached=CACHED, shown=min(len(played), EPISODES), total=len(played),
-        refresh=refresh, themes={name: Markup(_properties(one)) for name, one in THEMES.items()},
+        refresh=refresh, themes={name: Markup(_properties(one)) for name, one in vega.THEMES.items()},
         vega=Markup(vega.library().replace("</script", "<\\/script").replace("<!--", "<\\!--")), data=embedded(data),
     )  # fmt: skip
 
@@ -85,9 +83,9 @@ def embedded(content: Any) -> Markup:
     return Markup(found)
 
 
-def _properties(colors: Palette) -> str:
+def _properties(colors: vega.Palette) -> str:
     """Custom properties of the page's style."""
-    return "".join(f"--{name}:{value};" for name, value in {**colors, "font": FONT}.items())
+    return "".join(f"--{name}:{value};" for name, value in {**colors, "font": vega.FONT}.items())
 
 
 def _cards(found: Sequence[Recipe]) -> list[dict[str, Any]]:

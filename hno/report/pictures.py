@@ -13,8 +13,8 @@ from PIL import Image
 from hno.data.store import replace_whole
 from hno.evaluation.outcome import pooled
 from hno.report import charts, vega
+from hno.report.charts import encounter, separation
 from hno.report.episode import Episode, closest, distances, frames, whole
-from hno.report.episode_charts import encounter, separation
 from hno.report.recipes import by_type
 from hno.report.records import type_row
 from hno.report.verdicts import share

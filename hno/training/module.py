@@ -68,16 +68,7 @@ class TrainingModule(L.LightningModule):
         return {name: torch.stack(each).mean() for name, each in zip(read, zip(*reduced, strict=True), strict=True)}
 
     def _view(self, sample: Sample, field: Field, member: FieldFunction) -> View:
-        operator = self.operator
-        return View(
-            operator.game,
-            operator.problem,
-            sample,
-            field,
-            lambda at: member(at, None),
-            operator.scales,
-            self.global_step,
-        )
+        return self.operator.view(sample, field, lambda at: member(at, None), self.global_step)
 
     def _hardest(self, stream: str, sample: Sample) -> Sample:
         """The collocation points of the largest residuals, if only those count."""

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from hno.control import Feedback
-from hno.evaluation.kernels import TangentKernel
+from hno.evaluation.ntk import TangentKernel
 from hno.evaluation.sections import Evaluation
 from hno.evaluation.spectrum import spectrum, summary
 from hno.games import make

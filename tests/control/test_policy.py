@@ -14,6 +14,7 @@ from hno.control.policy import Answer
 from hno.control.receding_horizon import RecedingHorizon
 from hno.control.rollout import Disturbance, rollout
 from hno.types import Points
+from tests.crossing import Crossing
 from tests.operators.conftest import GAMES, random_points, small_operator
 from tests.walkers import Walkers
 
@@ -43,6 +44,27 @@ def test_the_answer_is_what_the_policy_says_of_a_batch(game: str, members: int) 
     for row, at in enumerate(zip(*points, strict=True)):
         close(policy.answer(*at), Answer(*(part[row] for part in wanted)))
     close(Answer(*torch.vmap(policy.answer)(*points)), wanted)
+
+
+@pytest.mark.parametrize("net", [torch.float32, torch.float64])
+@pytest.mark.parametrize("asked_in", [torch.float32, torch.float64])
+def test_every_answer_is_in_the_type_of_the_question(net: torch.dtype, asked_in: torch.dtype) -> None:
+    operator = small_operator("drone", exact_terminal=True).to(net).requires_grad_(False)
+    policy, points = Feedback(operator), Points(*(p.to(asked_in) for p in random_points(operator.game, 3)))
+    wanted = expected(policy, points)
+    mapped, alone = torch.vmap(policy.answer)(*points), policy.answer(*(part[0] for part in points))
+    assert {part.dtype for part in (*wanted, *mapped, *alone)} == {asked_in}
+    for part, other in zip(mapped, wanted, strict=True):
+        torch.testing.assert_close(part, other, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("trained", [True, False])
+@pytest.mark.parametrize("members", [1, 3])
+def test_three_players_are_answered_in_a_batch_without_a_warning(members: int, trained: bool) -> None:
+    operator = small_operator(Crossing(), members=members).double().requires_grad_(not trained)
+    policy, points = Feedback(operator), random_points(operator.game, 4)
+    close(Answer(*torch.vmap(policy.answer)(*points)), expected(policy, points))
 
 
 @pytest.mark.parametrize("members", [1, 3])

@@ -150,6 +150,24 @@ def test_a_broken_policy_is_not_safe() -> None:
     assert not bool(played.clearance > 0)
 
 
+@pytest.mark.parametrize("name", [*GAMES, "intersection"])
+def test_a_constraint_is_evaluated_once_a_step(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Clearance and penalty share it; costs are the same as those of a game that states the same penalty itself."""
+    game, calls = make(name), list[Tensor]()
+    constraint = type(game).constraint
+    monkeypatch.setattr(type(game), "constraint", lambda self, x, theta: calls.append(x) or constraint(self, x, theta))
+    x0, theta = game.initial_box.sample(3, torch.Generator().manual_seed(0)), torch.ones(3, game.players)
+    played = rollout(game, feedback(game), x0, theta, dt=0.5)
+    assert len(calls) == round(game.horizon / 0.5)
+    monkeypatch.setattr(type(game), "penalty", type(game).penalty if name == "intersection" else own_penalty)
+    assert torch.equal(rollout(game, feedback(game), x0, theta, dt=0.5).value, played.value)
+
+
+def own_penalty(game: Game, x: Tensor, theta: Tensor) -> Tensor:
+    """The default, stated again."""
+    return game.soft_constraint(game.constraint(x, theta)).sum(-1)
+
+
 @pytest.mark.parametrize("dt", [0.0, -0.1, 0.3, 2.0, math.nan, math.inf])
 def test_dt_must_divide_the_horizon(dt: float) -> None:
     game = Walkers()

@@ -8,9 +8,9 @@ from torch import Tensor
 
 from hno.cli.summary import show
 from hno.control.rollout import Disturbance, rollout
-from hno.evaluation.closed_loop import CollisionTable, TypeRow, collision_table, verdict
+from hno.evaluation.closed_loop import CollisionTable, TypeRow, verdict
 from hno.types import Extremal, Field, Points, Status
-from tests.fakes import fake_labels
+from tests.fakes import fake_labels, played_table
 from tests.walkers import Walkers
 
 GOOD, BAD = Status.CONVERGED, Status.STALLED
@@ -44,7 +44,7 @@ def test_every_start_is_of_one_kind_and_marginal_ones_are_apart() -> None:
     clearances = [0.5, 0.5, 0.01, 0.01, -0.2, 0.5]
     heights = [0.05, 0.9, 0.05, 0.9, 0.05, 0.05]
     labels = labelled(heights, clearances, [GOOD] * 5 + [BAD])
-    (row,) = collision_table(Walkers(), straight, [labels], seen=[])
+    (row,) = played_table(Walkers(), straight, [labels], seen=[])
     assert (
         row.outcome.starts,
         row.outcome.unsolved,
@@ -64,18 +64,18 @@ def test_every_start_is_of_one_kind_and_marginal_ones_are_apart() -> None:
 def test_medians_are_over_safe_starts_and_compare_with_the_label() -> None:
     heights = [0.5, 0.6, 0.7, 0.05]
     found = labelled(heights, [0.5, 0.5, 0.5, -1.0])
-    (row,) = collision_table(Walkers(), straight, [found], seen=[])
+    (row,) = played_table(Walkers(), straight, [found], seen=[])
     assert row.outcome.median_min_distance == pytest.approx(1.2, abs=1e-3)
     label_cost = -found.value[:3, 0].sum(-1)
     assert row.outcome.median_label_cost == pytest.approx(label_cost.median().item())
-    again = collision_table(Walkers(), straight, [found._replace(value=found.value - 50)], seen=[])
+    again = played_table(Walkers(), straight, [found._replace(value=found.value - 50)], seen=[])
     assert row.outcome.median_excess_cost is not None
     assert again[0].outcome.median_excess_cost == pytest.approx(row.outcome.median_excess_cost - 100, rel=1e-6)
 
 
 def test_rows_keep_their_type_and_order() -> None:
     sets = [labelled([0.9] * n, [0.5] * n, theta=theta) for n, theta in ((3, 1.0), (1, 4.0), (2, 0.5))]
-    rows = collision_table(Walkers(), straight, sets, seen=[(4.0, 4.0)])
+    rows = played_table(Walkers(), straight, sets, seen=[(4.0, 4.0)])
     assert [row.theta for row in rows] == [(1.0, 1.0), (4.0, 4.0), (0.5, 0.5)]
     assert [row.outcome.starts for row in rows] == [3, 1, 2]
     assert [row.seen for row in rows] == [False, True, False]
@@ -84,14 +84,14 @@ def test_rows_keep_their_type_and_order() -> None:
 def test_collision_radius_is_that_of_the_rows_type() -> None:
     """Walkers miss each other by 0.6 m; the radius is 0.2 + 0.2 theta."""
     sets = [labelled([0.3], [0.5], theta=theta) for theta in (1.0, 4.0, 1.5)]
-    rows = collision_table(Walkers(), straight, sets, seen=[])
+    rows = played_table(Walkers(), straight, sets, seen=[])
     assert [row.outcome.collisions for row in rows] == [0, 1, 0]
 
 
 def test_a_broken_policy_collides_everywhere() -> None:
     found = labelled([0.9, 0.9], [0.5, 0.01])
     nothing = torch.full((2, 2), torch.nan)
-    (row,) = collision_table(Walkers(), lambda tau, x, theta: nothing.expand(len(x), 2, 2), [found], seen=[])
+    (row,) = played_table(Walkers(), lambda tau, x, theta: nothing.expand(len(x), 2, 2), [found], seen=[])
     assert (row.outcome.collisions, row.outcome.marginal_collisions, row.outcome.rate) == (1, 1, 1.0)
 
 
@@ -102,12 +102,12 @@ def test_medians_that_are_not_finite_do_not_exist() -> None:
     def violent(tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
         return torch.tensor([[-1e20, 0.0], [0.0, 0.0]]).expand(len(x), 2, 2)
 
-    (row,) = collision_table(Walkers(), violent, [found], seen=[])
+    (row,) = played_table(Walkers(), violent, [found], seen=[])
     assert (row.outcome.collisions, row.outcome.median_excess_cost, row.outcome.median_excess_costs) == (0, None, None)
     assert row.outcome.median_label_cost is not None
     assert row.outcome.median_min_distance is not None
     nothing = torch.full((2, 2), torch.nan)
-    (row,) = collision_table(Walkers(), lambda tau, x, theta: nothing.expand(len(x), 2, 2), [found], seen=[])
+    (row,) = played_table(Walkers(), lambda tau, x, theta: nothing.expand(len(x), 2, 2), [found], seen=[])
     assert (row.outcome.median_min_distance, row.outcome.distance_quantiles) == (None, None)
 
 
@@ -121,7 +121,7 @@ def test_a_disturbance_reaches_the_episodes() -> None:
         return torch.stack([torch.full_like(tau, 4.0), speed], -1).unsqueeze(1).expand(-1, 2, -1)
 
     def collisions(disturbance: Disturbance) -> int:
-        (row,) = collision_table(Walkers(), aside, [found], [], disturbance=disturbance)
+        (row,) = played_table(Walkers(), aside, [found], [], disturbance=disturbance)
         assert row.outcome.safe_starts == 2
         return row.outcome.collisions
 
@@ -129,7 +129,7 @@ def test_a_disturbance_reaches_the_episodes() -> None:
     assert collisions(Disturbance(delay=25)) == 1
 
     def distance(disturbance: Disturbance) -> float | None:
-        return collision_table(Walkers(), aside, [found], [], disturbance=disturbance)[0].outcome.median_min_distance
+        return played_table(Walkers(), aside, [found], [], disturbance=disturbance)[0].outcome.median_min_distance
 
     assert distance(Disturbance(0.0, 0, 5)) == distance(Disturbance())
     noisy = [distance(Disturbance(0.05, 0, seed)) for seed in (1, 1, 2)]
@@ -147,7 +147,7 @@ def test_quantiles_saturation_and_own_costs_are_of_safe_starts() -> None:
         u[tau < 0.11, 0, 1] = 6.0
         return u * (x[:, 1:, 1:] > 0.1)
 
-    (row,) = collision_table(Walkers(), fast, [found], seen=[], dt=0.1)
+    (row,) = played_table(Walkers(), fast, [found], seen=[], dt=0.1)
     assert row.outcome.distance_quantiles == pytest.approx((1.02, 1.1, 1.2), abs=2e-3)
     assert row.outcome.distance_quantiles is not None
     assert row.outcome.distance_quantiles[-1] == row.outcome.median_min_distance
@@ -168,7 +168,7 @@ def test_errors_are_weighted_over_the_nodes_of_converged_labels() -> None:
         value, costate = (column[:2].flatten(0, 1).float() for column in (found.value, found.costate))
         return Field(0.9 * value, points.theta, costate + 0.1)
 
-    (row,) = collision_table(Walkers(), straight, [found], seen=[], field=field)
+    (row,) = played_table(Walkers(), straight, [found], seen=[], field=field)
     assert torch.equal(asked[0].x, found.x[:2].flatten(0, 1).float())
     torch.testing.assert_close(asked[0].tau, (1 - found.t).repeat(2).float())
     assert row.value_error == pytest.approx(0.1, rel=1e-5)
@@ -176,26 +176,26 @@ def test_errors_are_weighted_over_the_nodes_of_converged_labels() -> None:
 
 
 def test_without_a_value_function_or_a_label_there_are_no_errors() -> None:
-    (row,) = collision_table(Walkers(), straight, [labelled([0.9], [0.5])], seen=[])
+    (row,) = played_table(Walkers(), straight, [labelled([0.9], [0.5])], seen=[])
     assert (row.value_error, row.costate_error) == (None, None)
 
     def never(points: Points) -> Field:
         raise AssertionError("there is nothing to compare with")
 
-    (row,) = collision_table(Walkers(), straight, [labelled([0.9], [0.5], [BAD])], seen=[], field=never)
+    (row,) = played_table(Walkers(), straight, [labelled([0.9], [0.5], [BAD])], seen=[], field=never)
     assert (row.value_error, row.costate_error, row.outcome.saturated, row.outcome.distance_quantiles) == (None,) * 4
 
 
 def test_types_outside_the_range_of_the_game_are_marked() -> None:
     sets = [labelled([0.9], [0.5], theta=theta) for theta in (0.0, 4.0, 4.5)]
-    rows = collision_table(Walkers(), straight, sets, seen=[])
+    rows = played_table(Walkers(), straight, sets, seen=[])
     assert [row.extrapolated for row in rows] == [False, False, True]
     assert remarks(rows) == ["Outside the types that the game is made for, results extrapolate: (4.5, 4.5)."]
 
 
 def test_types_outside_the_box_around_the_trained_ones_are_marked() -> None:
     sets = [labelled([0.9], [0.5], theta=theta) for theta in (0.5, 1.0, 1.5, 3.0, 4.0)]
-    rows = collision_table(Walkers(), straight, sets, seen=[(1.0, 3.0), (3.0, 1.0)])
+    rows = played_table(Walkers(), straight, sets, seen=[(1.0, 3.0), (3.0, 1.0)])
     assert [row.outside_seen for row in rows] == [True, False, False, False, True]
     assert remarks(rows) == ["2 of 5 types lie outside the box around the trained ones: (0.5, 0.5), (4, 4)."]
 
@@ -203,7 +203,7 @@ def test_types_outside_the_box_around_the_trained_ones_are_marked() -> None:
 @pytest.fixture
 def nothing_safe() -> TypeRow:
     found = labelled([0.9, 0.9, 0.9], [-0.5, 0.01, 0.5], [GOOD, GOOD, BAD])
-    return collision_table(Walkers(), straight, [found], seen=[])[0]
+    return played_table(Walkers(), straight, [found], seen=[])[0]
 
 
 def test_without_a_safe_start_there_is_no_rate(nothing_safe: TypeRow) -> None:
@@ -231,7 +231,7 @@ def test_summary_says_not_applicable_and_not_zero(
 
 def test_verdict_adds_types_and_names_the_worst(nothing_safe: TypeRow) -> None:
     sets = [labelled([0.9] * 3, [0.5] * 3), labelled([0.9, 0.05], [0.5] * 2, theta=2.0)]
-    rows = [*collision_table(Walkers(), straight, sets, seen=[]), nothing_safe]
+    rows = [*played_table(Walkers(), straight, sets, seen=[]), nothing_safe]
     table = [row.content() for row in rows]
     assert verdict(table) == "1 collision in 5 safe starts (20.00 %); worst 50.00 % at (2, 2)."
     assert verdict(table[:1]) == "0 collisions in 3 safe starts (0.00 %)."

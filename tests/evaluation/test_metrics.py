@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from hno.evaluation.metrics import binned_mean, clopper_pearson, quantiles, saturated_share
+from hno.evaluation.metrics import clopper_pearson, quantiles, saturated_share
 from hno.games import Box, make
 
 
@@ -46,7 +46,6 @@ UNIT = Box([-1.0, 0.0], [1.0, 4.0])
 CONTROLS = torch.lerp(UNIT.lo, UNIT.hi, torch.randint(9, (40, 7, 2, 2), generator=GENERATOR) / 8)
 NUMBERS = torch.randn(40, generator=GENERATOR)
 MEASURED = torch.randn(40, 2, generator=GENERATOR)
-PLACE = torch.randint(4, (40,), generator=GENERATOR)
 
 
 def test_quantiles_are_those_of_numpy() -> None:
@@ -54,11 +53,13 @@ def test_quantiles_are_those_of_numpy() -> None:
     assert quantiles(NUMBERS, SHARES).tolist() == expected.tolist()
     assert float(quantiles(NUMBERS, [0.5])) == float(NUMBERS.median())
     assert quantiles(NUMBERS, [0.0, 1.0]).tolist() == [NUMBERS.min(), NUMBERS.max()]
+    assert quantiles(MEASURED, [0.5])[0].tolist() == MEASURED.median(0).values.tolist()
 
 
 def test_quantiles_of_nothing_are_no_numbers() -> None:
     assert bool(quantiles(NUMBERS[:0], SHARES).isnan().all())
     assert bool(quantiles(torch.tensor([1.0, torch.nan]), SHARES).isnan().all())
+    assert quantiles(MEASURED[:0], SHARES).shape == (3, 2)
 
 
 def test_saturated_controls_are_those_on_a_bound() -> None:
@@ -75,13 +76,6 @@ def test_a_drones_bounds_count_though_they_go_through_a_tangent() -> None:
 
 def test_there_is_no_share_of_no_controls() -> None:
     assert saturated_share(CONTROLS[:0], UNIT) is None
-
-
-def test_binned_means_are_means_of_bins() -> None:
-    found = binned_mean(MEASURED, PLACE, 5)
-    expected = [MEASURED[place == PLACE].abs().double().mean() for place in range(4)]
-    torch.testing.assert_close(found[:4], torch.stack(expected))
-    assert math.isnan(float(found[4]))
 
 
 def test_saturation_is_of_each_players_own_box() -> None:

@@ -10,11 +10,19 @@ from torch import Tensor, nn
 
 from hno.data.rows import NoLabelsError, rows_of
 from hno.evaluation import ntk
-from hno.evaluation.kernels import TangentKernel, type_entry
-from hno.evaluation.ntk import jacobian, points_per_block, residuals, rows_per_point, tangent_kernels, type_kernel
+from hno.evaluation.ntk import (
+    TangentKernel,
+    jacobian,
+    points_per_block,
+    residuals,
+    rows_per_point,
+    tangent_kernels,
+    type_entry,
+    type_kernel,
+)
 from hno.evaluation.spectrum import spectrum
 from hno.games import make
-from hno.losses import Scales, View, losses
+from hno.losses import Scales, losses
 from hno.operators import ValueOperator, make_operator
 from hno.operators.deeponet import MLP
 from hno.operators.gradient import GradientOperator
@@ -51,9 +59,7 @@ def double(sample: Sample) -> Sample:
 
 def training_residuals(operator: ValueOperator, sample: Sample) -> Tensor:
     """What training makes small, through the field and the loss terms of an operator in float64, (rows,)."""
-    view = View(
-        operator.game, operator.problem, sample, operator.field(sample.points), operator.field, operator.scales, 0
-    )
+    view = operator.view(sample, operator.field(sample.points))
     terms = (losses.get(name)() for name in ("residual", "value", "costate"))
     return torch.cat([(term.residual(view) / term.scale(view)).flatten(1) for term in terms], 1).flatten()
 

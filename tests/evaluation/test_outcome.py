@@ -8,7 +8,7 @@ from torch import Tensor
 
 from hno.control.rollout import rollout
 from hno.evaluation.metrics import clopper_pearson
-from hno.evaluation.outcome import outcome, pooled, together
+from hno.evaluation.outcome import outcome, outcomes, pooled
 from hno.types import Extremal, Trajectory, join, part
 from tests.fakes import fake_labels
 from tests.lq import LinearQuadratic
@@ -65,9 +65,9 @@ def test_a_broken_policy_is_no_safe_one() -> None:
 def test_types_together_are_one_set_of_episodes() -> None:
     halves = [played([0.0, 0.5]), played([0.6])]
     labels = [costing(torch.ones(2, 2)), costing(torch.ones(1, 2))]
-    whole = outcome(GAME, *together(labels, halves), 0.02)
+    parts, whole = outcomes(GAME, labels, halves, 0.02)
     assert whole == outcome(GAME, join(labels), played([0.0, 0.5, 0.6]), 0.02)
-    parts = [outcome(GAME, *pair, 0.02) for pair in zip(labels, halves, strict=True)]
+    assert parts == [outcome(GAME, *pair, 0.02) for pair in zip(labels, halves, strict=True)]
     assert (whole.collisions, whole.safe_starts) == (1, 3)
     assert whole.largest_excess_cost == max(found.largest_excess_cost or 0 for found in parts)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import pytest
@@ -13,13 +13,12 @@ from torch import Tensor
 from hno.cli.sections import show_section
 from hno.control import Policy
 from hno.control.rollout import Disturbance
-from hno.evaluation.closed_loop import collision_table
 from hno.evaluation.conditions import Condition, read_conditions
-from hno.evaluation.robustness import Robustness, robustness_row
+from hno.evaluation.robustness import Robustness
 from hno.evaluation.sections import Evaluation
 from hno.games import make
 from hno.types import Extremal
-from tests.fakes import fake_labels
+from tests.fakes import fake_labels, played_table
 from tests.walkers import Walkers
 
 
@@ -42,12 +41,21 @@ class StraightWalkers(Policy):
         return straight(tau, x, theta)
 
 
+def rows_of(
+    labels: Sequence[Extremal], conditions: Mapping[str, Any], dt: float = 0.02, types: Sequence[Any] = ((1.0, 1.0),)
+) -> list[dict[str, Any]]:
+    """Lines of the section for walkers who go straight, from the same labels under every condition."""
+    options = {"conditions": conditions, "clearance": 0.02, "dt": dt, "seed": 1}
+    walkers: Any = StraightWalkers()
+    return Robustness().compute(Evaluation("any", walkers, [], types, options, lambda condition: labels))
+
+
 SETS = [labelled([0.9, 0.05, 0.8]), labelled([0.9, 0.7], theta=2.0)]
 
 
-def test_the_undisturbed_line_repeats_the_collision_table() -> None:
-    row = robustness_row(Walkers(), straight, Condition("nothing"), SETS, 0.02, 0.02)
-    table = collision_table(Walkers(), straight, SETS, [])
+def test_the_undisturbed_line_repeats_the_played_table() -> None:
+    (row,) = rows_of(SETS, {"nothing": {}}, types=[(1.0, 1.0), (2.0, 2.0)])
+    table = played_table(Walkers(), straight, SETS, [])
     assert (row["safe_starts"], row["collisions"], row["rate"]) == (5, 1, 0.2)
     assert row["types"] == [
         {"theta": entry.theta, "safe_starts": entry.outcome.safe_starts, "collisions": entry.outcome.collisions}
@@ -77,7 +85,7 @@ def test_every_condition_plays_the_labels_of_its_width_and_its_own_disturbance()
 
 def test_without_safe_starts_there_are_no_rates() -> None:
     nothing = [labelled([0.9, 0.05], clearance=-1.0)]  # the second one collides, as its equilibrium does
-    row = robustness_row(Walkers(), straight, Condition("any"), nothing, 0.02, 0.1)
+    (row,) = rows_of(nothing, {"any": {}}, 0.1)
     assert (row["safe_starts"], row["collisions"]) == (0, 0)
     for name in ("rate", "interval", "median_excess_cost", "median_label_cost"):
         assert row[name] is None
@@ -125,7 +133,6 @@ def test_impossible_conditions(content: object, message: str) -> None:
 
 def test_without_a_collision_no_type_is_the_worst(capsys: pytest.CaptureFixture[str]) -> None:
     for heights, worst in (([0.9, 0.8], "none"), ([0.9, 0.05], "1 of 2 at (1, 1)")):
-        labels = [labelled(heights)]
-        row = robustness_row(Walkers(), straight, Condition("all"), labels, 0.02, 0.1)
+        (row,) = rows_of([labelled(heights)], {"all": {}}, 0.1)
         show_section("robustness", [row], {}, Console(width=140))
         assert worst in capsys.readouterr().out

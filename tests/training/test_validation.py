@@ -14,13 +14,12 @@ from torch import Tensor
 from hno.control import Feedback
 from hno.control.rollout import rollout
 from hno.data import Collocation, GameData, LabelPlan, make_sampler
-from hno.evaluation.closed_loop import collision_table
 from hno.games import Game, make
 from hno.training import validation
 from hno.training.module import TrainingModule
 from hno.training.validation import BEST, ClosedLoopValidation, Later, Score, score, starts_of
 from hno.types import Extremal, Field, Points, Trajectory, join
-from tests.fakes import fake_labels
+from tests.fakes import fake_labels, played_table
 from tests.operators.conftest import MakeModule
 from tests.walkers import Walkers
 
@@ -199,7 +198,7 @@ def test_episodes_are_those_of_the_evaluation(
     callback = make_validation(dt=0.1, probe=12)
     callback.begin(labels)
     found = callback.consider(Trainer(), module)
-    rows = collision_table(game, Feedback(module.operator.eval().requires_grad_(False)), labels, [], dt=0.1)
+    rows = played_table(game, Feedback(module.operator.eval().requires_grad_(False)), labels, [], dt=0.1)
     assert found is not None
     assert found.collision_rate == pytest.approx(sum(row.outcome.collisions for row in rows) / 24)
     single = [row.outcome.median_excess_cost for row in rows]
