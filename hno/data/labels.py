@@ -18,6 +18,7 @@ from torch import Tensor
 from hno.data.certificates import CLEARANCE, safe
 from hno.data.shards import SHARD, LabelSet
 from hno.data.store import canonical_json
+from hno.data.ties import tie_states
 from hno.games import Game
 from hno.pontryagin.solve import Solver, solve
 from hno.types import Extremal, Status, best_of, of_starts, part
@@ -45,6 +46,8 @@ class Request(NamedTuple):
     """Width of the start box in units of the game's."""
     symmetric: bool = False
     """Whether all players start in the same own state, that of the first player."""
+    ties: bool = False
+    """Whether the two cheapest equilibria of every start cost nearly the same, see `hno.data.ties`."""
     all_equilibria: bool = False
     """Whether every equilibrium that is found is a label, not only the cheapest of each start."""
 
@@ -71,7 +74,9 @@ def default_cache() -> Path:
 
 
 def start_states(game: Game, request: Request) -> Tensor:
-    """Uniform start states of a request, float64, (starts, P, n); more of them begin with the fewer.
+    """Random start states of a request, float64, (starts, P, n); more of them begin with the fewer.
+
+    They are uniform; ties are solved for, and there may be fewer of them.
 
     Raises:
         ValueError: symmetric ones of a game whose players are not interchangeable.
@@ -79,9 +84,13 @@ def start_states(game: Game, request: Request) -> Tensor:
     if request.symmetric and not interchangeable(game):
         raise ValueError(f"Symmetric starts need players of one role; {type(game).__name__} has roles {game.roles}.")
     text = canonical_json({"seed": request.seed, "split": request.split, "theta": [float(t) for t in request.theta]})
-    generator = torch.Generator().manual_seed(int(hashlib.sha256(text.encode()).hexdigest()[:15], 16))
-    drawn = game.initial_box.widened(request.widen).cpu().float().sample(request.starts, generator).double()
-    return drawn[:, :1].expand_as(drawn).contiguous() if request.symmetric else drawn
+    seed, box = int(hashlib.sha256(text.encode()).hexdigest()[:15], 16), game.initial_box.widened(request.widen)
+
+    def draw(size: int) -> Tensor:
+        drawn = box.cpu().float().sample(size, torch.Generator().manual_seed(seed)).double()
+        return drawn[:, :1].expand_as(drawn).contiguous() if request.symmetric else drawn
+
+    return tie_states(game, request.theta, request.starts, draw) if request.ties else draw(request.starts)
 
 
 def interchangeable(game: Game) -> bool:
@@ -101,7 +110,7 @@ def provenance(game: Game, request: Request, settings: Solver) -> dict[str, Any]
     """Everything that determines labels, but for how many there are: row k of a set is always the same."""
     content = request._replace(theta=tuple(map(float, request.theta)))._asdict()
     del content["starts"]
-    for name in ("symmetric", "all_equilibria"):  # keeps the keys of sets that are older than these
+    for name in ("symmetric", "ties", "all_equilibria"):  # keeps the keys of sets that are older than these
         if not content[name]:
             del content[name]
     return {
@@ -234,11 +243,14 @@ class _Job(NamedTuple):
 
 def _jobs(game: Game, labels: LabelSet, request: Request) -> Iterator[_Job]:
     """What a set lacks of a request; what it has is verified."""
-    for shard, x0 in enumerate(start_states(game, request).split(SHARD)):
-        have = labels.read_shard(shard).starts if labels.starts(shard) else 0
-        if have < len(x0):
-            labels.check_writable()
-            yield _Job(labels, shard, x0, have, request.theta, request.all_equilibria)
+    shards = range((request.starts - 1) // SHARD + 1)
+    have = [labels.read_shard(shard).starts if labels.starts(shard) else 0 for shard in shards]
+    if sum(have) >= request.starts and all(count == SHARD for count in have[:-1]):
+        return
+    labels.check_writable()
+    for shard, (x0, count) in enumerate(zip(start_states(game, request).split(SHARD), have, strict=False)):
+        if count < len(x0):
+            yield _Job(labels, shard, x0, count, request.theta, request.all_equilibria)
 
 
 def _run(game: Game, jobs: Sequence[_Job], settings: Solver, workers: int | None) -> Iterator[Tensor]:

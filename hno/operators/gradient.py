@@ -83,10 +83,11 @@ class GradientOperator(ValueOperator):
     def field(self, points: Points, types: Types | None = None) -> Field:
         """Value, time derivative and every costate of all players: medians over the members, entry by entry."""
         types = types or distinct_types(points.theta)
-        first, *others = (member(points, types) for member in self.members)
-        if not others:
-            return first
-        return Field(*(torch.stack(parts).median(0).values for parts in zip(first, *others, strict=True)))
+        found = [member(points, types) for member in self.members]
+        if len(found) == 1:
+            return found[0]
+        columns = zip(*((f.value, f.dvalue_dtau, f.costate) for f in found), strict=True)
+        return Field(*(torch.stack(parts).median(0).values for parts in columns))
 
     @property
     def members(self) -> Sequence[FieldFunction]:

@@ -152,5 +152,5 @@ def test_any_batch_shape_of_points():
     field = feedback_field(game, symmetric(game), at)
     flat = hji_residual(game, at, field)
     grid_points = Points(*(part.unflatten(0, (4, 8)) for part in at))
-    grid = hji_residual(game, grid_points, Field(*(part.unflatten(0, (4, 8)) for part in field)))
+    grid = hji_residual(game, grid_points, Field(*(part.unflatten(0, (4, 8)) for part in field[:3])))
     torch.testing.assert_close(grid.flatten(0, 1), flat)
