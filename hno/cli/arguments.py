@@ -8,18 +8,34 @@ from typing import NamedTuple
 
 from hno.registry import unknown_name
 
-FLAGS = {"-h": "--help", "--help": "--help", "--version": "--version", "--dry-run": "--dry-run"}
-VALUE_FLAGS = {"--to": "--to"}
-HYDRA_FLAGS = {
-    "-m": "--multirun", "--multirun": "--multirun", "-sc": "--shell-completion", "--resolve": "--resolve",
-    "--shell-completion": "--shell-completion", "--hydra-help": "--hydra-help",
-}  # fmt: skip
-HYDRA_VALUE_FLAGS = {
-    "-cd": "--config-dir", "--config-dir": "--config-dir", "-c": "--cfg", "--cfg": "--cfg", "-p": "--package",
-    "--package": "--package", "-i": "--info", "--info": "--info",
-}  # fmt: skip
-KNOWN = FLAGS | VALUE_FLAGS | HYDRA_FLAGS | HYDRA_VALUE_FLAGS
-"""Every flag and its long form."""
+
+class Flag(NamedTuple):
+    """A flag, by its long form."""
+
+    about: str = ""
+    """For the help; none for those that only Hydra explains."""
+    short: str = ""
+    value: bool = False
+    """Whether it takes one."""
+    hydra: bool = False
+    """Whether Hydra takes it."""
+
+
+FLAGS = {
+    "--dry-run": Flag("print the configuration (with -m: the jobs) after it has been checked, and end"),
+    "--to": Flag("PATH: where results go", value=True),
+    "--multirun": Flag("(or -m) run every combination of values that are separated by commas", "-m", hydra=True),
+    "--config-dir": Flag("FOLDER: choices of your own, such as FOLDER/experiment/mine.yaml", "-cd", True, True),
+    "--help": Flag("this text", "-h"),
+    "--version": Flag("hno's version"),
+    "--cfg": Flag("", "-c", True, True),
+    "--package": Flag("", "-p", True, True),
+    "--info": Flag("", "-i", True, True),
+    "--resolve": Flag(hydra=True),
+    "--hydra-help": Flag(hydra=True),
+    "--shell-completion": Flag("", "-sc", hydra=True),
+}
+"""Every flag, anywhere on the line."""
 TYPES = re.compile(r"""(\+*(?:theta|unseen|(?:\w+\.)*types)=)([-+.\d][^'"\[\]{}$]*[,;][^'"\[\]{}$]*)""")
 """Player types as a list of numbers, which Hydra's grammar takes in quotes only."""
 
@@ -44,8 +60,8 @@ class Arguments(NamedTuple):
     @property
     def hydra(self) -> list[str]:
         """The flags that are Hydra's."""
-        given = {name: self.flags[name] for name in self.flags if name in HYDRA_FLAGS or name in HYDRA_VALUE_FLAGS}
-        return [word for name, value in given.items() for word in (name, *([value] if value else []))]
+        given = [(name, value) for name, value in self.flags.items() if FLAGS[name].hydra]
+        return [word for pair in given for word in pair if word]
 
 
 def parse(given: Sequence[str]) -> Arguments:
@@ -55,19 +71,20 @@ def parse(given: Sequence[str]) -> Arguments:
         UsageError: an unknown flag, or one without the value that it needs.
     """
     found, rest = Arguments([], [], {}), list(given)
+    known = {form: name for name, flag in FLAGS.items() for form in (name, flag.short) if form}
     while rest:
         word = rest.pop(0)
         name, equals, value = word.partition("=")
         if not word.startswith("-"):
             (found.overrides if equals or word.startswith("~") else found.words).append(word)
             continue
-        if name not in KNOWN:
-            raise UsageError(unknown_name("flag", name, sorted(KNOWN)))
-        if not equals and (name in VALUE_FLAGS or name in HYDRA_VALUE_FLAGS):
+        if name not in known:
+            raise UsageError(unknown_name("flag", name, sorted(known)))
+        if not equals and FLAGS[known[name]].value:
             if not rest:
                 raise UsageError(f"{name} needs a value.")
             value = rest.pop(0)
-        found.flags[KNOWN[name]] = value
+        found.flags[known[name]] = value
     return found
 
 

@@ -11,12 +11,10 @@ from omegaconf import DictConfig
 from hno.cli.checkpoints import resumed
 from hno.cli.config import read
 from hno.cli.evaluate import check_evaluation, unseen_types
-from hno.cli.results import plain
-from hno.cli.schema import GameSettings, TrainSettings
-from hno.cli.starts import cache_folder
+from hno.cli.settings import GameSettings, TrainSettings
 from hno.data import Collocation, GameData, LabelPlan, make_sampler
 from hno.data.curriculum import Curriculum
-from hno.data.labels import Report
+from hno.data.labels import Report, default_cache
 from hno.evaluation.kernels import check_rows
 from hno.games import Game, make
 from hno.games.grid import parse_types
@@ -56,18 +54,18 @@ def build_game(settings: GameSettings) -> Game:
 
 def build_architecture(settings: TrainSettings) -> Architecture:
     """What the operator is built of."""
-    options = {name: value for name, value in settings.operator.items() if name not in ("name", "function")}
-    function = Choice(settings.operator["function"], options)
-    return Architecture(function, _choice(settings.network), _choice(settings.activation))
+    operator = dict(settings.operator)
+    operator["name"] = operator.pop("function")
+    return Architecture(*map(_choice, (operator, settings.network, settings.activation)))
 
 
 def _choice(content: dict[str, Any]) -> Choice:
-    return Choice(content["name"], {name: value for name, value in content.items() if name != "name"})
+    return Choice(content["name"], {key: value for key, value in content.items() if key != "name"})
 
 
 def build_objective(settings: TrainSettings) -> Objective:
     """The method: loss terms and weights."""
-    return make_objective(**plain(settings.loss))
+    return make_objective(**settings.loss.model_dump())
 
 
 def build_data(settings: TrainSettings, game: Game, needed: frozenset[str], report: Report | None = None) -> GameData:
@@ -81,11 +79,11 @@ def build_data(settings: TrainSettings, game: Game, needed: frozenset[str], repo
         trajectories=data.trajectories,
         validation=data.validation,
         files=[Path(file) for file in data.files],
-        cache=cache_folder(data.cache),
+        cache=Path(data.cache or default_cache()),
         workers=data.workers,
     )
     collocation = Collocation(make_sampler(settings.sampler), curriculum, data.interior_types)
-    return GameData(game, needed, settings.seed, labels, collocation, plain(data.batch_sizes), report)
+    return GameData(game, needed, settings.seed, labels, collocation, data.batch_sizes.model_dump(), report)
 
 
 def build_settings(settings: TrainSettings) -> Settings:

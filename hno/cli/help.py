@@ -9,7 +9,6 @@ from typing import Any
 
 import yaml  # type: ignore[import-untyped]  # yaml has no annotations
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
 from hno.cli.arguments import Arguments
@@ -25,7 +24,7 @@ def configuration_help(name: str, given: Arguments) -> str:
     overrides = for_hydra(name, given)
     try:
         config = compose(name, overrides)
-    except (HydraException, SettingsError):  # values of a sweep, or mistakes of which a run will speak
+    except SettingsError:  # values of a sweep, or mistakes of which a run will speak
         config = compose(name, [])
     said = dict(comments((config_dir() / f"{name}.yaml").read_text(encoding="utf-8")))
     parts = []

@@ -3,122 +3,103 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Collection, Mapping
-from typing import Any
+import pkgutil
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Annotated, Any
 
-from pydantic import PlainValidator, ValidationInfo
+from pydantic import AfterValidator, BeforeValidator, ValidationInfo, create_model
 
-from hno.cli.entries import number
-from hno.cli.kinds import GIVEN, REGISTRIES
-from hno.registry import check_options, options_of
+from hno.cli.schema import Amount, Positive, Settings, validated
+from hno.registry import Registry, options_of
 
+REGISTRIES: Mapping[str, Callable[[], Registry[Any]]] = {
+    kind: partial(pkgutil.resolve_name, place)
+    for kind, place in {
+        "game": "hno.games:games",
+        "operator": "hno.operators:operators",
+        "network": "hno.operators:networks",
+        "activation": "hno.operators:activations",
+        "loss": "hno.losses:losses",
+        "source": "hno.data.sources:sources",
+        "optimizer": "hno.training.optimizers:optimizers",
+    }.items()
+}
+"""The registry of every kind, as a function that imports it."""
+GIVEN = {
+    "operator": ("game", "network"),
+    "network": ("inputs", "activation"),
+    "optimizer": ("params", "parameters", "lr"),
+}
+"""Arguments of constructors that the package passes: they are no options."""
 SHARED = ("exact_terminal", "members")
 """Options of an operator that files of games and methods set."""
-SCHEDULE = ("lr", "schedule", "final_lr")
+SCHEDULE: Mapping[str, Any] = {"lr": (Positive, ...), "schedule": (str, ...), "final_lr": (Positive, ...)}
 """Entries of an optimiser that belong to the schedule of its rate."""
 
 
-def checked(kind: str, name: object, given: object) -> dict[str, Any]:
-    """Options of a registered name, with its defaults for those that are not given.
-
-    Raises:
-        ValueError: it or an option is unknown, or an option is of another type than its default.
-    """
-    given = given if isinstance(given, Mapping) else {}
+def _schema(kind: str, name: object, also: Mapping[str, Any]) -> type[Settings]:
+    """The schema of a registered name: each option has the type of its default."""
     try:
-        factory, skip = REGISTRIES[kind]().get(str(name)), GIVEN.get(kind, ())
-        check_options(f"{kind} {name}", factory, given, skip=skip)
+        factory = REGISTRIES[kind]().get(str(name))
     except LookupError as error:
-        raise ValueError(f": {error}") from error
-    options = options_of(factory, skip=skip) | {str(key): value for key, value in given.items()}
-    signature = inspect.signature(factory).parameters
-    for key, default in options_of(factory, skip=skip).items():
-        if options[key] is inspect.Parameter.empty:
-            raise ValueError(f".{key} is missing: {kind} {name} has no default for it.")
-        whole = type(default) is int and signature[key].annotation in (float, "float")  # torch writes 0 for 0.0
-        expected, met = _LIKE.get(float if whole else type(default), ("", lambda value: True))
-        if not met(options[key]):
-            raise ValueError(f".{key} must be {expected}; got {options[key]!r}.")
-    return options
+        raise ValueError(str(error)) from error
+    annotations = {key: parameter.annotation for key, parameter in inspect.signature(factory).parameters.items()}
+    fields: dict[str, Any] = {}
+    for key, default in options_of(factory, skip=GIVEN.get(kind, ())).items():
+        whole = type(default) is int and annotations[key] not in (float, "float")  # torch writes 0 for 0.0
+        known = int if whole else {bool: bool, int: float, float: float, str: str}.get(type(default), Any)
+        fields[key] = (known, ... if default is inspect.Parameter.empty else default)
+    return create_model(str(name), __base__=Settings, **fields, **also)
 
 
-_LIKE: Mapping[type, tuple[str, Callable[[Any], bool]]] = {
-    bool: ("true or false", lambda value: isinstance(value, bool)),
-    int: ("a whole number", lambda value: type(value) is int),
-    float: ("a finite number", number),
-    str: ("text", lambda value: isinstance(value, str)),
-}
-"""What an option must be, by the type of its default."""
+def _part(kind: str, also: Mapping[str, Any] = {}) -> AfterValidator:  # it is read only
+    """A registered name with some of its options."""
+
+    def check(content: dict[str, Any]) -> dict[str, Any]:
+        schema = _schema(kind, content.get("name"), {"name": (str, ...), **also})
+        return validated(schema, content).model_dump(exclude_unset=True)
+
+    return AfterValidator(check)
 
 
-def part(kind: str) -> PlainValidator:
-    """A registered name with its options."""
+def _several(kind: str, also: Mapping[str, Any] = {}) -> AfterValidator:  # it is read only
+    """Options by registered name, all of them; null removes one."""
 
-    def check(content: Any) -> dict[str, Any]:
-        found = mapping(content, ("name",))
-        checked(kind, found["name"], {key: value for key, value in found.items() if key != "name"})
-        return found
+    def check(content: dict[str, Any]) -> dict[str, dict[str, Any]]:
+        schemas: dict[str, Any] = {
+            name: (_schema(kind, name, also) | None, None) for name in REGISTRIES[kind]().names()
+        }
+        found = validated(create_model(kind, __base__=Settings, **schemas), content).model_dump()
+        return {name: found[name] for name in content if found[name] is not None}
 
-    return PlainValidator(check)
-
-
-def optimizer(content: Any) -> dict[str, Any]:
-    """A registered optimiser with its options, and the schedule of its learning rate."""
-    found = mapping(content, ("name", *SCHEDULE))
-    for key in ("lr", "final_lr"):
-        if not (type(found[key]) in (int, float) and found[key] > 0):
-            raise ValueError(f".{key} must be a positive number; got {found[key]!r}.")
-    checked("optimizer", found["name"], {key: value for key, value in found.items() if key not in ("name", *SCHEDULE)})
-    return found
+    return AfterValidator(check)
 
 
-def mapping(content: Any, needed: Collection[str] = ()) -> dict[str, Any]:
-    """A mapping that has some entries."""
-    if not isinstance(content, Mapping) or not set(needed) <= content.keys():
-        entries = f" with {' and '.join(needed)}" if needed else ""
-        raise ValueError(f" must be a mapping{entries}; got {content!r}.")
-    return {str(key): value for key, value in content.items()}
-
-
-def operator(content: Any, info: ValidationInfo) -> dict[str, Any]:
-    """A method's name, its registered function and that function's options.
+def _operator(content: dict[str, Any], info: ValidationInfo) -> dict[str, Any]:
+    """A method's name, its registered function and all of that function's options.
 
     Files of games and methods set `SHARED` options; a function that does not know them is not given them.
     """
-    options = mapping(content, ("name", "function"))
-    name, function = options.pop("name"), options.pop("function")
-    given = (info.context or {}).get("given", ())
-    registry = REGISTRIES["operator"]()
-    if function in registry.names():
-        known = options_of(registry.get(function), skip=GIVEN["operator"])
-        options = {k: v for k, v in options.items() if k in known or k not in SHARED or f"operator.{k}" in given}
-    return {"name": name, "function": function, **checked("operator", function, options)}
+    schema = _schema("operator", content.get("function"), {"name": (str, ...), "function": (str, ...)})
+    given = {key for key in SHARED if f"operator.{key}" in (info.context or {}).get("given", ())}
+    dropped = set(SHARED) - schema.model_fields.keys() - given
+    return validated(schema, {k: v for k, v in content.items() if k not in dropped}).model_dump()
 
 
-def terms(content: Any) -> dict[str, dict[str, Any]]:
-    """Loss terms and all their options; null removes one."""
-    return {
-        name: checked("loss", name, mapping(given)) for name, given in mapping(content).items() if given is not None
-    }
+def _shares(content: Any) -> Any:
+    """A source's share may stand by itself."""
+    if not isinstance(content, Mapping):
+        return content
+    return {k: v if v is None or isinstance(v, Mapping) else {"share": v} for k, v in content.items()}
 
 
-def weights(content: Any) -> dict[str, float]:
-    """Weights; null removes one."""
-    found = {name: weight for name, weight in mapping(content).items() if weight is not None}
-    for name, weight in found.items():
-        if not (number(weight) and weight >= 0):
-            raise ValueError(f".{name} must be a finite number of at least 0; got {weight!r}.")
-    return found
-
-
-def sampler(content: Any) -> dict[str, dict[str, Any]]:
-    """Shares of sources, and all their options; null removes one."""
-    found = {}
-    for name, entry in mapping(content).items():
-        options = mapping({"share": entry} if not isinstance(entry, Mapping) else entry)
-        share = options.pop("share", None)
-        if not (number(share) and share >= 0) and entry is not None:
-            raise ValueError(f".{name} must have a share, a finite number of at least 0; got {entry!r}.")
-        if entry is not None:
-            found[name] = {"share": share, **checked("source", name, options)}
-    return found
+Operator = Annotated[dict[str, Any], AfterValidator(_operator)]
+Network = Annotated[dict[str, Any], _part("network")]
+Activation = Annotated[dict[str, Any], _part("activation")]
+Optimizer = Annotated[dict[str, Any], _part("optimizer", SCHEDULE)]
+Sampler = Annotated[dict[str, Any], BeforeValidator(_shares), _several("source", {"share": (Amount, ...)})]
+Terms = Annotated[dict[str, Any], _several("loss")]
+Weights = Annotated[
+    dict[str, Amount | None], AfterValidator(lambda found: {k: v for k, v in found.items() if v is not None})
+]

@@ -39,16 +39,11 @@ class Job(NamedTuple):
     """What the command line chose for it."""
 
     @classmethod
-    def current(cls) -> Job | None:
-        """The one that runs here; None outside a multirun."""
+    def current(cls) -> Job:
+        """The one that runs here."""
         hydra = HydraConfig.get()
-        if hydra.mode is None or hydra.mode.name != "MULTIRUN":
-            return None
-        return cls(
-            hydra.job.num,
-            Path(hydra.runtime.output_dir),
-            tuple(setting.lstrip("+") for setting in hydra.overrides.task),
-        )
+        settings = tuple(setting.lstrip("+") for setting in hydra.overrides.task)
+        return cls(hydra.job.num, Path(hydra.runtime.output_dir), settings)
 
     def results(self) -> dict[str, Any]:
         """Content of its results.json; without one that can be read, a failure that says so."""

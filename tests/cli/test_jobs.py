@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from hno.cli import pages, train
+from hno.cli import launch, pages
 from hno.cli.sweep import Job, show_jobs
 from tests.cli.conftest import SMOKE, Command, Outcome
 from tests.report.tables import type_row
@@ -104,13 +104,13 @@ def test_an_interrupted_multirun_shows_what_there_is(
 ) -> None:
     outcomes = iter([True, KeyboardInterrupt()])
 
-    def task(config: object) -> bool:
+    def perform(*job: object) -> bool:
         outcome = next(outcomes)
         if isinstance(outcome, BaseException):
             raise outcome
         return outcome
 
-    monkeypatch.setattr(train, "train", task)
+    monkeypatch.setattr(launch, "perform", perform)
     printed: list[int] = []
     monkeypatch.setattr("hno.cli.launch.show_jobs", lambda jobs: printed.extend(job.number for job in jobs))
     run = command("train", "-m", f"hydra.sweep.dir={tmp_path}/sweep", *SMOKE, "seed=0,1,2")
@@ -135,7 +135,7 @@ def test_a_failed_run_has_a_page_with_its_reason(command: Command, monkeypatch: 
 def test_a_job_that_is_refused_leaves_its_reason_and_no_page(
     command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(train, "train", lambda settings: True)
+    monkeypatch.setattr(launch, "perform", lambda *job: True)
     sweep = f"hydra.sweep.dir={tmp_path}/sweep"
     run = command("train", "-m", sweep, *SMOKE, "operator=hno,sno", "loss.weights.residual=0.1")
     assert run.code == 1

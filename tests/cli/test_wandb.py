@@ -93,7 +93,7 @@ def test_disabled_wandb_leaves_nothing(command: Command) -> None:
 def test_unknown_mode(command: Command) -> None:
     run = command("train", *SMOKE, "logger=wandb", "logger.mode=onlin")
     assert run.code == 1
-    assert "logger.mode must be one of auto, disabled, offline, online; got 'onlin'" in run.text
+    assert "logger.mode must be 'auto', 'disabled', 'offline' or 'online'; got 'onlin'" in run.text
 
 
 @pytest.mark.parametrize("mode", ["disabled", "offline", "online"])
