@@ -8,34 +8,18 @@ from typing import NamedTuple
 
 from hno.registry import unknown_name
 
-
-class Flag(NamedTuple):
-    """A flag, by its long form."""
-
-    about: str = ""
-    """For the help; none for those that only Hydra explains."""
-    short: str = ""
-    value: bool = False
-    """Whether it takes one."""
-    hydra: bool = False
-    """Whether Hydra takes it."""
-
-
 FLAGS = {
-    "--dry-run": Flag("print the configuration (with -m: the jobs) after it has been checked, and end"),
-    "--to": Flag("PATH: where results go", value=True),
-    "--multirun": Flag("(or -m) run every combination of values that are separated by commas", "-m", hydra=True),
-    "--config-dir": Flag("FOLDER: choices of your own, such as FOLDER/experiment/mine.yaml", "-cd", True, True),
-    "--help": Flag("this text", "-h"),
-    "--version": Flag("hno's version"),
-    "--cfg": Flag("", "-c", True, True),
-    "--package": Flag("", "-p", True, True),
-    "--info": Flag("", "-i", True, True),
-    "--resolve": Flag(hydra=True),
-    "--hydra-help": Flag(hydra=True),
-    "--shell-completion": Flag("", "-sc", hydra=True),
+    "--dry-run": "print the configuration (with -m: the jobs) after it has been checked, and end",
+    "--to": "PATH: where results go",
+    "--multirun": "(or -m) run every combination of values that are separated by commas; anywhere on the line",
+    "--config-dir": "FOLDER: choices of your own, such as FOLDER/experiment/mine.yaml",
+    "--help": "this text",
+    "--version": "hno's version",
+    "--shell-completion": "install=SHELL, for its eval: completion of keys and choices",
 }
 """Every flag, anywhere on the line."""
+SHORT = {"-h": "--help", "-m": "--multirun", "-cd": "--config-dir", "-sc": "--shell-completion"}
+WITH_VALUE = ("--to", "--config-dir")
 TYPES = re.compile(r"""(\+*(?:theta|unseen|(?:\w+\.)*types)=)([-+.\d][^'"\[\]{}$]*[,;][^'"\[\]{}$]*)""")
 """Player types as a list of numbers, which Hydra's grammar takes in quotes only."""
 
@@ -57,12 +41,6 @@ class Arguments(NamedTuple):
     flags: dict[str, str]
     """Long forms and values; those without a value have ""."""
 
-    @property
-    def hydra(self) -> list[str]:
-        """The flags that are Hydra's."""
-        given = [(name, value) for name, value in self.flags.items() if FLAGS[name].hydra]
-        return [word for pair in given for word in pair if word]
-
 
 def parse(given: Sequence[str]) -> Arguments:
     """Sort words into flags, overrides and others.
@@ -71,20 +49,20 @@ def parse(given: Sequence[str]) -> Arguments:
         UsageError: an unknown flag, or one without the value that it needs.
     """
     found, rest = Arguments([], [], {}), list(given)
-    known = {form: name for name, flag in FLAGS.items() for form in (name, flag.short) if form}
     while rest:
         word = rest.pop(0)
         name, equals, value = word.partition("=")
         if not word.startswith("-"):
             (found.overrides if equals or word.startswith("~") else found.words).append(word)
             continue
-        if name not in known:
-            raise UsageError(unknown_name("flag", name, sorted(known)))
-        if not equals and FLAGS[known[name]].value:
+        flag = SHORT.get(name, name)
+        if flag not in FLAGS:
+            raise UsageError(unknown_name("flag", name, [*FLAGS]))
+        if not equals and flag in WITH_VALUE:
             if not rest:
                 raise UsageError(f"{name} needs a value.")
             value = rest.pop(0)
-        found.flags[known[name]] = value
+        found.flags[flag] = value
     return found
 
 

@@ -29,6 +29,12 @@ def _found(path: str, names: tuple[str, ...]) -> Path:
     for file in files:
         if file.is_file():
             return file
+    runs = sorted(found.parent.name for name in names for found in place.glob(f"*/{name}"))
+    if runs:
+        raise CheckpointError(
+            f"{path} is the folder of a sweep: name one of its runs, such as {place / runs[0]}. "
+            f"It holds {', '.join(dict.fromkeys(runs))}."
+        )
     raise CheckpointError(
         f"There is no checkpoint at {' or '.join(map(str, files))}. Train one with `hno train`, or name its folder."
     )

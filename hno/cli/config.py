@@ -131,29 +131,26 @@ def _swept(name: str, experiment: Sequence[str]) -> set[str]:
     return set(HydraConfig.get().sweeper.params or ())
 
 
-def compose(name: str, overrides: Sequence[str]) -> DictConfig:
+def compose(name: str, overrides: Sequence[str], *, registered: bool = False) -> DictConfig:
     """A configuration as Hydra composes it, without a job; interpolations that name `hydra` work.
 
-    Registries are imported for choices without a file only.
+    Args:
+        name: the root configuration.
+        overrides: as Hydra takes them.
+        registered: whether registered classes are known to Hydra; otherwise they are looked up for a choice without a
+            file only.
 
     Raises:
         SettingsError: Hydra cannot compose it.
     """
     try:
-        return _composed(name, overrides)
-    except MissingConfigException:
+        with hydra.initialize_config_dir(str(config_dir()), version_base="1.3"):
+            config = hydra.compose(name, overrides=list(overrides), return_hydra_config=True)
+    except HydraException as error:
+        if registered or not isinstance(error, MissingConfigException):
+            raise SettingsError(sentence(error)) from error
         register_plugins()
-    except HydraException as error:
-        raise SettingsError(sentence(error)) from error
-    try:
-        return _composed(name, overrides)
-    except HydraException as error:
-        raise SettingsError(sentence(error)) from error
-
-
-def _composed(name: str, overrides: Sequence[str]) -> DictConfig:
-    with hydra.initialize_config_dir(str(config_dir()), version_base="1.3"):
-        config = hydra.compose(name, overrides=list(overrides), return_hydra_config=True)
+        return compose(name, overrides, registered=True)
     HydraConfig.instance().set_config(config)
     OmegaConf.set_struct(config, False)
     del config["hydra"]
@@ -164,7 +161,7 @@ def sentence(error: Exception) -> str:
     """What an error means: of Hydra's, choices that do not exist and overrides that cannot be read."""
     if isinstance(error, MissingConfigException) and error.missing_cfg_file is not None:
         group, _, choice = error.missing_cfg_file.rpartition("/")
-        return unknown_name(group, choice, sorted(error.options or ()))
+        return unknown_name("method" if group == "operator" else group, choice, sorted(error.options or ()))
     if isinstance(error, OverrideParseException):
         return f"{error.override} cannot be read: {str(error).splitlines()[0]}."
     return str(error)
@@ -223,8 +220,7 @@ def under_hydra(name: str, job: Callable[[DictConfig], Any], words: Sequence[str
         sys.argv = before
 
 
-def hydras_own(name: str, given: Arguments) -> int:
-    """What Hydra does by itself: shell completion, and its help."""
+def complete(name: str, words: Sequence[str]) -> None:
+    """Hydra's own completion for shells."""
     Plugins.instance().register(Folders)
-    under_hydra(name, lambda config: None, [*given.hydra, *given.overrides])
-    return 0
+    under_hydra(name, lambda config: None, ["--shell-completion", *words])

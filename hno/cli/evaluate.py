@@ -10,7 +10,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import torch
 from omegaconf import DictConfig
 
 from hno.cli import launch
@@ -18,7 +17,7 @@ from hno.cli.arguments import Arguments
 from hno.cli.checkpoints import trained
 from hno.cli.config import read
 from hno.cli.logs import label_progress, use_threads
-from hno.cli.media import draw_typical
+from hno.cli.media import draw_typical, title_of
 from hno.cli.results import Results, config_hash, write_json
 from hno.cli.sections import chosen_sections, run_sections
 from hno.cli.settings import Episodes, EvaluateSettings
@@ -30,7 +29,7 @@ from hno.evaluation.conditions import table_condition
 from hno.evaluation.episodes import EPISODES, episodes
 from hno.evaluation.sections import Evaluation
 from hno.games import Game
-from hno.games.grid import parse_types
+from hno.games.grid import parse_types, quarter_types
 from hno.training.checkpoint import LearnedPolicy, load_policy
 from hno.types import Extremal
 
@@ -39,8 +38,6 @@ log = logging.getLogger(__name__)
 Types = tuple[float, ...]
 """One type per player."""
 Table = list[dict[str, Any]]
-QUARTERS = ((0, 1), (1, 1), (1, 3), (3, 4))
-"""Places in the type box, of the first player and of the others, in quarters of its edges."""
 
 
 def run(given: Arguments) -> int:
@@ -118,7 +115,7 @@ def evaluate(settings: EvaluateSettings, results: Results) -> None:
     labels, played = solve_tests(evaluations[0], results), list[Evaluation]()
     for model, evaluation in zip(models, evaluations, strict=True):
         log.info("evaluation of %s", evaluation.name)
-        found, model["table"] = (assess if played else evaluate_policy)(evaluation, labels, results)
+        found, model["table"] = play_starts(evaluation, labels, results)
         played.append(found)
         for name, content in run_sections(found, results):
             model[name] = content
@@ -153,11 +150,9 @@ def unseen_types(game: Game, choice: Any, key: str) -> list[Types]:
         choice: what `parse_types` takes; None for the four.
         key: where the choice stands, for messages.
     """
-    if choice is not None:
-        return parse_types(game, choice, key=key) if choice else []
-    lo, width = game.type_box.lo, game.type_box.hi - game.type_box.lo
-    quarters = [[own, *[others] * (game.players - 1)] for own, others in QUARTERS]
-    return game.validate_types([(lo + width * torch.tensor(row) / 4).tolist() for row in quarters])
+    if choice is None:
+        return quarter_types(game)
+    return [] if choice == [] else parse_types(game, choice, key=key)
 
 
 def solve_tests(evaluation: Evaluation, results: Results) -> list[Extremal]:
@@ -169,27 +164,23 @@ def solve_tests(evaluation: Evaluation, results: Results) -> list[Extremal]:
     return labels
 
 
-def evaluate_policy(evaluation: Evaluation, labels: Sequence[Extremal], results: Results) -> tuple[Evaluation, Table]:
-    """As `assess`; the table goes into the results, some episodes are kept and one is drawn."""
-    found, table = assess(evaluation, labels, results)
-    folder, game = results.path.parent, found.game
-    kept = episodes(game, found.played, labels, found.clearance)
-    write_json(folder / EPISODES, kept)
-    conditions = {name: found.options[name] for name in ("clearance", "dt", "widen", "noise", "delay")}
-    results.update(**conditions, constraint_unit=game.constraint_unit, table=table, episodes=EPISODES)
-    title = " / ".join(str(results.content[name]) for name in ("game", "operator", "activation"))
-    draw_typical(kept["episodes"], folder / "rollout.png", title)
-    return found, table
+def play_starts(evaluation: Evaluation, labels: Sequence[Extremal], results: Results) -> tuple[Evaluation, Table]:
+    """Play from the starts of the labels. The first model's table goes into the results, and some episodes are kept.
 
-
-def assess(evaluation: Evaluation, labels: Sequence[Extremal], results: Results) -> tuple[Evaluation, Table]:
-    """Play from the starts of the labels: the evaluation with its episodes, and the rows of its table."""
-    began = time.perf_counter()
-    disturbance = evaluation.condition.disturbance
-    played = play(evaluation.game, evaluation.policy, labels, evaluation.dt, disturbance)
+    Returns:
+        The evaluation with its episodes, and the rows of its table.
+    """
+    began, game, folder = time.perf_counter(), evaluation.game, results.path.parent
+    played = play(game, evaluation.policy, labels, evaluation.dt, evaluation.condition.disturbance)
     found = evaluation._replace(labels=labels, played=played)
     table = CollisionTable().compute(found)
     results.time("evaluation", time.perf_counter() - began)
+    if results.content["episodes"] is None:
+        kept = episodes(game, played, labels, found.clearance)
+        write_json(folder / EPISODES, kept)
+        conditions = {name: found.options[name] for name in ("clearance", "dt", "widen", "noise", "delay")}
+        results.update(**conditions, constraint_unit=game.constraint_unit, table=table, episodes=EPISODES)
+        draw_typical(kept["episodes"], folder / "rollout.png", title_of(results.content))
     return found, table
 
 

@@ -13,14 +13,13 @@ from rich.console import Console
 from rich.table import Table
 
 from hno.cli.arguments import Arguments
-from hno.cli.build import build_game
 from hno.cli.config import configured, read
 from hno.cli.logs import label_progress, use_threads
 from hno.cli.settings import LabelSettings
 from hno.data.certificates import GLOBAL_GAP, LOCAL_GAP, summary
 from hno.data.labels import Request, default_cache, label_set, labels_for
 from hno.data.store import LabelFileError
-from hno.games import Game
+from hno.games import Game, make
 from hno.games.grid import parse_types
 from hno.types import Status
 
@@ -48,7 +47,7 @@ def run(given: Arguments) -> int:
 
 def generate(settings: LabelSettings) -> None:
     """Generate, and print a table and where the sets are."""
-    game, cache = build_game(settings.game), Path(settings.cache or default_cache())
+    game, cache = make(settings.game.name, **settings.game.constants), Path(settings.cache or default_cache())
     requests = [
         Request(theta, settings.n, settings.seed, settings.split, settings.widen)
         for theta in parse_types(game, settings.theta, key="theta")

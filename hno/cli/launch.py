@@ -22,7 +22,8 @@ from hno.cli.config import configured, for_hydra, quoted, register_plugins, sent
 from hno.cli.logs import finish_wandb, send_lightning_to_hydra
 from hno.cli.results import Results, recorded
 from hno.cli.sections import show
-from hno.cli.sweep import Job, counted, show_jobs
+from hno.cli.sweep import Job, show_jobs
+from hno.evaluation.format import counted
 from hno.registry import UnknownNameError
 from hno.training.checkpoint import CheckpointError
 
@@ -57,11 +58,11 @@ def run(task: Task, given: Arguments) -> int:
     Returns:
         The exit code: 1 if a job failed.
     """
+    many = "--multirun" in given.flags
     try:
-        if "--multirun" in given.flags:
-            return _sweep(task, given)
-        settings = configured(task.name, task.check, given)
-        return 0 if settings is None else _single(task, settings, given)
+        if not many and configured(task.name, task.check, given) is None:
+            return 0  # a dry run
+        return _jobs(task, given, many, dry=many and "--dry-run" in given.flags)
     except REFUSALS as error:
         message = sentence(error)
     except OSError as error:
@@ -70,52 +71,37 @@ def run(task: Task, given: Arguments) -> int:
     return 1
 
 
-def _single(task: Task, settings: Any, given: Arguments) -> int:
-    done: list[tuple[Path, bool]] = []
-
-    def job(config: DictConfig) -> None:
-        folder = Path(HydraConfig.get().runtime.output_dir)
-        done.append((folder, perform(task, settings, folder)))
-
-    under_hydra(task.name, job, [*given.hydra, *for_hydra(task.name, given)])
-    for folder, _ in done:
-        print(pages.write(folder))
-    return 0 if all(succeeded for _, succeeded in done) else 1
-
-
-def _sweep(task: Task, given: Arguments) -> int:
-    """Every job, and a table of them, also when the sweep is interrupted; a dry run prints what the jobs would be."""
+def _jobs(task: Task, given: Arguments, many: bool, dry: bool) -> int:
+    """Let Hydra run every job. A sweep ends with a table, also when it is interrupted; a dry one prints its jobs."""
     jobs: list[Job] = []
     outcomes: list[bool] = []
-    dry = "--dry-run" in given.flags
 
     def job(config: DictConfig) -> None:
         current = Job.current()
         jobs.append(current)
+        if dry:
+            print(f"{current.number}: {' '.join(current.settings)}")
         try:
             settings = task.check(config)
         except Exception as error:
+            print(f"   refused: {error}") if dry else _refuse(current, error)
             outcomes.append(False)
-            if dry:
-                print(f"{current.number}: {' '.join(current.settings)}\n   refused: {error}")
-            else:
-                _refuse(current, error)
-            return
-        if dry:
-            print(f"{current.number}: {' '.join(current.settings)}")
-        outcomes.append(dry or perform(task, settings, current.folder))
+        else:
+            outcomes.append(dry or perform(task, settings, current.folder))
 
-    words = [*given.hydra, *for_hydra(task.name, given)]
+    words = [*(["--multirun"] if many else []), *for_hydra(task.name, given)]
     register_plugins()
     with tempfile.TemporaryDirectory() as nowhere:
         try:
             under_hydra(task.name, job, [*words, *QUIET, f"hydra.sweep.dir={quoted(nowhere)}"] if dry else words)
         finally:
-            if jobs and not dry:
+            if many and jobs and not dry:
                 show_jobs(jobs)
     if dry:
         refused = outcomes.count(False)
-        print(counted(len(jobs)) + (f", {refused} refused" if refused else ""))
+        print(counted(len(jobs), "job") + (f", {refused} refused" if refused else ""))
+    if not many:
+        print(pages.write(jobs[0].folder))
     return 0 if all(outcomes) else 1
 
 

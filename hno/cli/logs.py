@@ -24,8 +24,6 @@ from hno.cli.settings import TrainSettings
 from hno.data.labels import Progress, Report
 
 log = logging.getLogger(__name__)
-
-
 EXPECTED = (
     ".*exists and is not empty",  # results.json is there first, on purpose
     ".*isinstance.treespec, LeafSpec.",  # Lightning's own, from torch 2.13 on
@@ -38,8 +36,7 @@ def send_lightning_to_hydra() -> None:
     """Let Lightning's messages and Python's warnings reach Hydra's handlers, console and file."""
     logging.captureWarnings(True)
     warnings.formatwarning = lambda message, category, *_, **__: f"{category.__name__}: {message}"
-    for message in EXPECTED:
-        warnings.filterwarnings("ignore", message=message)
+    warnings.filterwarnings("ignore", message="|".join(EXPECTED))
     logging.getLogger("lightning.pytorch.utilities.rank_zero").addFilter(lambda line: "Tip:" not in line.getMessage())
     for name in ("lightning", "lightning.pytorch", "lightning.fabric"):
         logger = logging.getLogger(name)
@@ -55,8 +52,7 @@ def quiet_lightning() -> Iterator[None]:
     logger.setLevel(logging.WARNING)
     try:
         with warnings.catch_warnings():
-            for message in EXPECTED:
-                warnings.filterwarnings("ignore", message=message)
+            warnings.filterwarnings("ignore", message="|".join(EXPECTED))
             yield
     finally:
         logger.setLevel(before)
@@ -84,7 +80,11 @@ def loggers(settings: TrainSettings, folder: Path) -> list[Logger]:
         if name == "csv":
             made.append(CSVLogger(folder, name="", version="csv"))
         elif name == "tensorboard":
-            made.append(_tensorboard(folder))
+            try:
+                made.append(TensorBoardLogger(folder, name="", version="tensorboard", default_hp_metric=False))
+            except ModuleNotFoundError as error:
+                message = "TensorBoard is not installed: `pip install tensorboard`, or choose logger=csv."
+                raise LoggerMissingError(message) from error
         elif (mode := wandb_mode(settings.logger.mode)) != "disabled":
             made.append(
                 WandbLogger(
@@ -93,14 +93,6 @@ def loggers(settings: TrainSettings, folder: Path) -> list[Logger]:
                 )
             )  # fmt: skip
     return made
-
-
-def _tensorboard(folder: Path) -> Logger:
-    try:
-        return TensorBoardLogger(folder, name="", version="tensorboard", default_hp_metric=False)
-    except ModuleNotFoundError as error:
-        message = "TensorBoard is not installed: `pip install tensorboard`, or choose logger=csv."
-        raise LoggerMissingError(message) from error
 
 
 def finish_wandb(results: Mapping[str, Any]) -> None:

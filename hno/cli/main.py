@@ -111,10 +111,11 @@ def _run(command: Command, given: Arguments, prog: str) -> int:
     if "--help" in given.flags:
         print(_help(command, given, prog), flush=True)
         return 0
-    if command.config is not None and {"--shell-completion", "--hydra-help"} & given.flags.keys():
-        from hno.cli.config import hydras_own
+    if command.config is not None and "--shell-completion" in given.flags:
+        from hno.cli.config import complete
 
-        return hydras_own(command.config, given)
+        complete(command.config, given.overrides)
+        return 0
     return int(pkgutil.resolve_name(command.run)(_configured(command, given, prog)))
 
 
@@ -139,7 +140,7 @@ def _overview() -> str:
 
 def _help(command: Command, given: Arguments, prog: str) -> str:
     flags = (*command.flags, "--help", "--version")
-    shown = [f"  {name:<14}{flag.about}" for name, flag in FLAGS.items() if name in flags and flag.about]
+    shown = [f"  {name:<20}{about}" for name, about in FLAGS.items() if name in flags]
     parts = [f"Usage: {prog} {command.usage}", command.about, "\n".join(["Flags", *shown])]
     if command.config is not None:
         from hno.cli.help import configuration_help

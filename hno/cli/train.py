@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import shutil
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,24 +12,23 @@ import lightning as L
 
 from hno.cli import launch
 from hno.cli.arguments import Arguments
-from hno.cli.build import build_architecture, build_data, build_game, build_objective, build_settings, check
+from hno.cli.build import build, check, how_to_train
 from hno.cli.checkpoints import resumed
-from hno.cli.evaluate import describe, evaluate_policy, solve_tests, unseen_types
+from hno.cli.evaluate import describe, play_starts, solve_tests, unseen_types
 from hno.cli.logs import StepBar, StepLines, label_progress, loggers, use_threads
 from hno.cli.media import publish
 from hno.cli.results import Results, config_hash
 from hno.cli.sections import run_sections
 from hno.cli.settings import TrainSettings
-from hno.data.certificates import safe_sets, summary
+from hno.data.certificates import safe_sets, summaries
 from hno.data.datamodule import GameData
 from hno.data.labels import Request, default_cache, safe_labels_for
 from hno.games.grid import parse_types
-from hno.operators import make_operator
 from hno.training.checkpoint import Provenance, check_resumable, load_policy, record
 from hno.training.divergence import DivergedError
 from hno.training.fit import Fitted, fit
 from hno.training.validation import BEST, PROBE, Later
-from hno.types import Extremal, part
+from hno.types import Extremal
 
 log = logging.getLogger(__name__)
 
@@ -61,7 +59,7 @@ def train(settings: TrainSettings, results: Results) -> None:
     types = [*policy.types, *unseen_types(policy.game, chosen.types, "evaluation.types")]
     models = [(str(results.content["checkpoint"]), policy)]
     (evaluation,) = describe(models, types, chosen.model_dump(), settings.data.cache, settings.data.workers)
-    played, _ = evaluate_policy(evaluation, solve_tests(evaluation, results), results)
+    played, _ = play_starts(evaluation, solve_tests(evaluation, results), results)
     for name, content in run_sections(played, results):
         results.update(**{name: content})
     publish(fitted.trainer.loggers, results.content, folder, fitted.trainer.global_step)
@@ -71,12 +69,9 @@ def train_operator(settings: TrainSettings, folder: Path, results: Results) -> F
     """Solve labels and train; the folder gets `last.ckpt` and `best.ckpt`, the results how it went and which to use."""
     L.seed_everything(settings.seed, verbose=False)
     use_threads(settings.trainer.threads)
-    game, architecture, objective = build_game(settings.game), build_architecture(settings), build_objective(settings)
-    operator = make_operator(game, architecture)
-    needed = objective.streams(exact_terminal=operator.meets_terminal)
-    data = build_data(settings, game, needed, label_progress())
+    architecture, operator, objective, data = build(settings, label_progress())
     origin = Provenance(settings.operator["name"], data.type_list, settings.seed, config_hash(settings))
-    entries, makers = record(game, architecture, origin), loggers(settings, folder)
+    entries, makers = record(data.game, architecture, origin), loggers(settings, folder)
     resume = None if settings.resume is None else resumed(settings.resume)
     if resume is not None:
         check_resumable(resume, entries)
@@ -84,13 +79,13 @@ def train_operator(settings: TrainSettings, folder: Path, results: Results) -> F
 
     data.setup("fit")
     results.time("labels", data.label_seconds)
-    results.update(label_statistics=label_statistics(data.extremals))
+    results.update(label_statistics=summaries(data.extremals))
     first, later = validation_starts(settings, data, results)
     before = results.content["seconds"].get("validation_labels", 0.0)
     bar = StepBar() if sys.stdout.isatty() else StepLines(settings.trainer.print_every)
     try:
         fitted = fit(
-            operator, objective, data, build_settings(settings), folder, validation=first, later=later, record=entries,
+            operator, objective, data, how_to_train(settings), folder, validation=first, later=later, record=entries,
             loggers=makers, callbacks=[bar], resume=resume,
         )  # fmt: skip
     except DivergedError:
@@ -108,15 +103,6 @@ def train_operator(settings: TrainSettings, folder: Path, results: Results) -> F
         validation=None if fitted.best is None else fitted.best._asdict(),
     )
     return fitted
-
-
-def label_statistics(labels: Sequence[Extremal]) -> list[dict[str, Any]]:
-    """What the certificates of the training labels say, type by type."""
-    return [
-        {"theta": theta.tolist(), **summary(part(found, (found.theta == theta).all(-1)))}
-        for found in labels
-        for theta in found.theta.unique(dim=0)
-    ]
 
 
 def validation_starts(settings: TrainSettings, data: GameData, results: Results) -> tuple[list[Extremal], Later | None]:

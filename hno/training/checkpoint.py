@@ -16,6 +16,7 @@ from hno.control.policy import Feedback
 from hno.games import Game, games, make
 from hno.operators import Architecture, Choice, ValueOperator, make_operator
 from hno.pontryagin.threads import torch_threads
+from hno.registry import UnknownNameError
 
 KEY = "hno"
 """Checkpoint entry that says how to build the operator and where it comes from."""
@@ -125,6 +126,11 @@ def load_operator(path: str | Path, game: str | None = None) -> tuple[ValueOpera
     found = content[KEY]
     if game is not None and found["game"] != game:
         raise CheckpointError(f"{path} is a checkpoint of game {found['game']!r}, expected {game!r}.")
+    if found["game"] not in games.names():
+        raise UnknownNameError(
+            f"{path} is of the game {found['game']!r}, which is not registered here. If a script of your own registers "
+            f"it, import that script first. Known: {', '.join(games.names())}."
+        )
     built = make(found["game"], **found["constants"])
     if built.fingerprint() != found["fingerprint"]:
         raise CheckpointError(f"{path} was trained on another version of the game {found['game']!r}. Train it again.")

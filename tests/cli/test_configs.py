@@ -8,7 +8,7 @@ import pytest
 from omegaconf import DictConfig
 
 from hno.cli.arguments import Arguments
-from hno.cli.build import build_architecture, build_data, build_game, build_objective, check
+from hno.cli.build import build, check
 from hno.cli.calls import train_settings
 from hno.cli.config import choices, compose, config_dir, for_hydra, groups, register_plugins
 from hno.cli.main import main
@@ -18,7 +18,6 @@ from hno.data import GameData
 from hno.data.exchange import write_own
 from hno.games import make
 from hno.losses import STREAMS
-from hno.operators import make_operator
 from tests.fakes import fake_labels
 
 GROUPS = sorted(path.name for path in config_dir().iterdir() if path.is_dir())
@@ -42,9 +41,7 @@ def settings(*overrides: str) -> TrainSettings:
 
 
 def data_of(chosen: TrainSettings) -> GameData:
-    game = build_game(chosen.game)
-    operator = make_operator(game, build_architecture(chosen))
-    return build_data(chosen, game, build_objective(chosen).streams(exact_terminal=operator.meets_terminal))
+    return build(chosen).data
 
 
 @pytest.mark.parametrize(("group", "choice"), CHOICES)

@@ -140,6 +140,27 @@ def test_without_a_checkpoint(command: Command) -> None:
 
 
 @pytest.mark.usefixtures("no_labels")
+def test_the_folder_of_a_sweep_is_no_checkpoint(command: Command, tmp_path: Path) -> None:
+    for name in ("0_sno", "1_hno"):
+        (tmp_path / "sweep").mkdir(exist_ok=True)
+        save_random(tmp_path / "sweep" / name / "last.ckpt")
+    sweep = tmp_path / "sweep"
+    run = command("evaluate", f"checkpoint={sweep}")
+    refused(run, f"{sweep} is the folder of a sweep: name one of its runs, such as {sweep}/0_sno", "0_sno, 1_hno.")
+    refused(command("train", *SMOKE, f"resume={sweep}"), f"{sweep} is the folder of a sweep")
+
+
+@pytest.mark.usefixtures("no_labels")
+def test_the_game_of_a_script_is_registered_by_importing_it(command: Command, tmp_path: Path) -> None:
+    path = save_random(tmp_path / "random" / "last.ckpt")
+    content = torch.load(path, weights_only=True)
+    content["hno"]["game"] = "crossing"
+    torch.save(content, path)
+    run = command("evaluate", f"checkpoint={path}")
+    refused(run, "'crossing', which is not registered here", "import that script first", "Known: ", "narrow_road")
+
+
+@pytest.mark.usefixtures("no_labels")
 @pytest.mark.parametrize("kept", [0.0, 0.5, 0.99])
 def test_truncated_checkpoint(command: Command, random_checkpoint: Path, kept: float) -> None:
     content = random_checkpoint.read_bytes()

@@ -75,11 +75,11 @@ def test_a_job_without_readable_results_is_a_failed_one(
 
 def test_a_failed_job_is_in_the_table_with_its_reason_and_the_others_go_on(command: Command, tmp_path: Path) -> None:
     sweep = tmp_path / "sweep"
-    run = command("train", "-m", f"hydra.sweep.dir={sweep}", *SMOKE, "trainer.max_steps=2", "optimizer.lr=inf,0.001")
+    run = command("train", "-m", f"hydra.sweep.dir={sweep}", *SMOKE, "trainer.max_steps=2", "optimizer.lr=1e30,0.001")
     assert run.code == 1
     table = run.text[run.text.index("2 jobs") :]
     assert [(row[0], row[5], row[-1]) for row in lines(table)] == [
-        ("0", "optimizer.lr=inf", "failed"), ("1", "optimizer.lr=0.001", "finished"),
+        ("0", "optimizer.lr=1e+30", "failed"), ("1", "optimizer.lr=0.001", "finished"),
     ]  # fmt: skip
     assert "Job 0 failed: DivergedError: " in table
     assert table.splitlines()[-1] == f"Page: {sweep}"

@@ -71,7 +71,7 @@ def test_the_whole_multirun_of_the_documentation(tmp_path: Path) -> None:
 
 
 def test_a_failed_run_is_finished_too(command: Command) -> None:
-    run = command("train", *SMOKE, "logger=wandb", "optimizer.lr=inf")
+    run = command("train", *SMOKE, "logger=wandb", "optimizer.lr=1e30")
     assert run.code == 1
     assert wandb.run is None
     kept = offline_run(run.folder)
