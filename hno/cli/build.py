@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 from omegaconf import DictConfig
 
-from hno.cli.checkpoints import resumed
 from hno.cli.config import read
 from hno.cli.evaluate import check_evaluation, unseen_types
 from hno.cli.settings import TrainSettings
@@ -20,7 +19,8 @@ from hno.games import Game, make
 from hno.games.grid import parse_types
 from hno.losses import Objective, make_objective
 from hno.operators import Architecture, Choice, ValueOperator, make_operator
-from hno.training.fit import Settings
+from hno.training.checkpoint import find_checkpoint
+from hno.training.fit import LAST, Settings
 from hno.training.optimizers import make_optimizer
 
 
@@ -51,7 +51,7 @@ def check(config: DictConfig) -> TrainSettings:
         if settings.evaluation.ntk:
             check_rows(built.operator, settings.evaluation.ntk_rows)
     if settings.resume is not None:
-        resumed(settings.resume)
+        find_checkpoint(settings.resume, [LAST])
     return settings
 
 

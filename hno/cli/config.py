@@ -7,7 +7,7 @@ import inspect
 import os
 import re
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
@@ -24,8 +24,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 import hno
 from hno.cli.arguments import Arguments, UsageError, rewritten
-from hno.cli.parts import GIVEN, REGISTRIES
-from hno.cli.schema import S, SettingsError, validated
+from hno.cli.schema import GIVEN, REGISTRIES, S, SettingsError, validated
 from hno.cli.settings import TrainSettings
 from hno.registry import options_of, plural, unknown_name
 
@@ -67,11 +66,6 @@ def groups(name: str) -> list[str]:
     """Groups that a root configuration composes."""
     defaults: Any = OmegaConf.select(OmegaConf.load(config_dir() / f"{name}.yaml"), "defaults") or []
     return [str(group) for entry in defaults if OmegaConf.is_dict(entry) for group in entry]
-
-
-def folders() -> set[str]:
-    """Names of all groups that there are."""
-    return {path.name for folder in Folders.all() for path in folder.iterdir() if path.is_dir()}
 
 
 def choices(group: str) -> dict[str, Path | None]:
@@ -119,16 +113,12 @@ def for_hydra(name: str, given: Arguments) -> list[str]:
         raise UsageError(f"--config-dir: there is no folder {folder}.")
     Folders.own = [] if folder is None else [Path(folder)]
     Plugins.instance().register(Folders)
-    composed, untouched = groups(name), folders()
-    if "--multirun" in given.flags:
-        untouched |= _swept(name, [override for override in given.overrides if override.startswith("experiment=")])
-    return [rewritten(override, composed, untouched) for override in given.overrides]
-
-
-def _swept(name: str, experiment: Sequence[str]) -> set[str]:
-    """Keys that an experiment sweeps over: Hydra lets the command line narrow them under the same name only."""
-    compose(name, experiment)
-    return set(HydraConfig.get().sweeper.params or ())
+    swept: Collection[str] = ()
+    if "--multirun" in given.flags:  # Hydra lets the command line narrow an experiment's sweep under the same name only
+        compose(name, [override for override in given.overrides if override.startswith("experiment=")])
+        swept = HydraConfig.get().sweeper.params or ()
+    composed = groups(name)
+    return [rewritten(override, composed, swept) for override in given.overrides]
 
 
 def compose(name: str, overrides: Sequence[str], *, registered: bool = False) -> DictConfig:

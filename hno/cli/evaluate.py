@@ -14,7 +14,6 @@ from omegaconf import DictConfig
 
 from hno.cli import launch
 from hno.cli.arguments import Arguments
-from hno.cli.checkpoints import trained
 from hno.cli.config import read
 from hno.cli.logs import label_progress, use_threads
 from hno.cli.media import draw_typical, title_of
@@ -30,7 +29,7 @@ from hno.evaluation.episodes import EPISODES, episodes
 from hno.evaluation.sections import Evaluation
 from hno.games import Game
 from hno.games.grid import parse_types, quarter_types
-from hno.training.checkpoint import LearnedPolicy, load_policy
+from hno.training.checkpoint import LearnedPolicy, find_checkpoint, load_policy
 from hno.types import Extremal
 
 log = logging.getLogger(__name__)
@@ -62,13 +61,13 @@ def check(config: DictConfig) -> EvaluateSettings:
 
 def head(settings: EvaluateSettings) -> dict[str, Any]:
     """What results.json says from the beginning."""
-    first = str(trained(settings.checkpoint[0]))
+    first = str(find_checkpoint(settings.checkpoint[0]))
     return {"checkpoint": first, "config_hash": config_hash(settings), "config": settings.model_dump()}
 
 
 def prepared(settings: EvaluateSettings) -> tuple[list[LearnedPolicy], list[Evaluation]]:
     """The models and their evaluations, before labels are solved. Raises as `check`."""
-    paths = [str(trained(path)) for path in settings.checkpoint]
+    paths = [str(find_checkpoint(path)) for path in settings.checkpoint]
     policies = [load_policy(path, settings.expected_game) for path in paths]
     check_same_game(paths, [policy.game for policy in policies])
     check_evaluation(policies[0].game, settings)

@@ -8,7 +8,7 @@ import warnings
 from hno.cli.arguments import Arguments, UsageError
 from hno.cli.config import choices, config_dir
 from hno.cli.help import heading
-from hno.cli.parts import REGISTRIES
+from hno.cli.schema import REGISTRIES
 from hno.registry import Description, plural, unknown_name
 
 KINDS = ("game", "method", "operator", "network", "activation", "loss", "source", "optimizer")

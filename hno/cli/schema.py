@@ -1,15 +1,18 @@
-"""What configurations may hold: one schema for every command."""
+"""The schema of configurations: entries of given types, and registered parts with the options of their constructors."""
 
 from __future__ import annotations
 
+import inspect
+import pkgutil
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
+from functools import partial
 from typing import Annotated, Any, TypeVar, get_args
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, create_model
 from pydantic_core import PydanticCustomError
 
-from hno.registry import unknown_name
+from hno.registry import Registry, options_of, unknown_name
 
 
 class SettingsError(ValueError):
@@ -73,3 +76,86 @@ Share = Annotated[float, Field(ge=0, le=1)]
 Text = Annotated[str, Field(min_length=1)]
 Loose = Annotated[Any, AfterValidator(_loose)]
 """What Lightning judges, or `hno.games.grid.parse_types`."""
+REGISTRIES: Mapping[str, Callable[[], Registry[Any]]] = {
+    kind: partial(pkgutil.resolve_name, place)
+    for kind, place in {
+        "game": "hno.games:games",
+        "operator": "hno.operators:operators",
+        "network": "hno.operators:networks",
+        "activation": "hno.operators:activations",
+        "loss": "hno.losses:losses",
+        "source": "hno.data.sources:sources",
+        "optimizer": "hno.training.optimizers:optimizers",
+    }.items()
+}
+"""The registry of every kind, as a function that imports it."""
+GIVEN = {
+    "operator": ("game", "network"),
+    "network": ("inputs", "activation"),
+    "optimizer": ("params", "parameters", "lr"),
+}
+"""Arguments of constructors that the package passes: they are no options."""
+SHARED = ("exact_terminal", "members")
+"""Options of an operator that files of games and methods set."""
+SCHEDULE: Mapping[str, Any] = {"lr": (Positive, ...), "schedule": (str, ...), "final_lr": (Positive, ...)}
+"""Entries of an optimiser that belong to the schedule of its rate."""
+
+
+def _schema(kind: str, name: object, also: Mapping[str, Any]) -> type[Settings]:
+    """The schema of a registered name: each option has the type of its default."""
+    try:
+        factory = REGISTRIES[kind]().get(str(name))
+    except LookupError as error:
+        raise ValueError(str(error)) from error
+    annotations = {key: parameter.annotation for key, parameter in inspect.signature(factory).parameters.items()}
+    fields: dict[str, Any] = {}
+    for key, default in options_of(factory, skip=GIVEN.get(kind, ())).items():
+        whole = type(default) is int and annotations[key] not in (float, "float")  # torch writes 0 for 0.0
+        known = int if whole else {bool: bool, int: float, float: float, str: str}.get(type(default), Any)
+        fields[key] = (known, ... if default is inspect.Parameter.empty else default)
+    return create_model(str(name), __base__=Settings, **fields, **also)
+
+
+def _part(kind: str, also: Mapping[str, Any] = {}) -> AfterValidator:  # it is read only
+    """A registered name with some of its options."""
+
+    def check(content: dict[str, Any]) -> dict[str, Any]:
+        schema = _schema(kind, content.get("name"), {"name": (str, ...), **also})
+        return validated(schema, content).model_dump(exclude_unset=True)
+
+    return AfterValidator(check)
+
+
+def _several(kind: str, also: Mapping[str, Any] = {}) -> AfterValidator:  # it is read only
+    """Options by registered name, all of them; null removes one."""
+
+    def check(content: dict[str, Any]) -> dict[str, dict[str, Any]]:
+        schemas: dict[str, Any] = {
+            name: (_schema(kind, name, also) | None, None) for name in REGISTRIES[kind]().names()
+        }
+        found = validated(create_model(kind, __base__=Settings, **schemas), content).model_dump()
+        return {name: found[name] for name in content if found[name] is not None}
+
+    return AfterValidator(check)
+
+
+def _operator(content: dict[str, Any], info: ValidationInfo) -> dict[str, Any]:
+    """A method's name, its registered function and all of that function's options.
+
+    Files of games and methods set `SHARED` options; a function that does not know them is not given them.
+    """
+    schema = _schema("operator", content.get("function"), {"name": (str, ...), "function": (str, ...)})
+    given = {key for key in SHARED if f"operator.{key}" in (info.context or {}).get("given", ())}
+    dropped = set(SHARED) - schema.model_fields.keys() - given
+    return validated(schema, {k: v for k, v in content.items() if k not in dropped}).model_dump()
+
+
+Operator = Annotated[dict[str, Any], AfterValidator(_operator)]
+Network = Annotated[dict[str, Any], _part("network")]
+Activation = Annotated[dict[str, Any], _part("activation")]
+Optimizer = Annotated[dict[str, Any], _part("optimizer", SCHEDULE)]
+Sampler = Annotated[dict[str, Any], _several("source", {"share": (Amount, ...)})]
+Terms = Annotated[dict[str, Any], _several("loss")]
+Weights = Annotated[
+    dict[str, Amount | None], AfterValidator(lambda found: {k: v for k, v in found.items() if v is not None})
+]

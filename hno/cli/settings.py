@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
 
-from hno.cli import parts
+from hno.cli import schema
 from hno.cli.schema import Amount, Count, Loose, Positive, Seed, Settings, Share, Size, Text
 
 
@@ -44,8 +44,8 @@ class DataSettings(Settings):
 class LossSettings(Settings):
     """A method: its terms and weights; null removes one."""
 
-    terms: parts.Terms
-    weights: parts.Weights
+    terms: schema.Terms
+    weights: schema.Weights
     norm: Literal["huber", "l1", "l2"]
     scaled: bool
     balance: bool
@@ -109,13 +109,13 @@ class TrainSettings(Settings):
     """`hno train`."""
 
     game: GameSettings
-    operator: parts.Operator
-    network: parts.Network
-    activation: parts.Activation
+    operator: schema.Operator
+    network: schema.Network
+    activation: schema.Activation
     data: DataSettings
-    sampler: parts.Sampler
+    sampler: schema.Sampler
     loss: LossSettings
-    optimizer: parts.Optimizer
+    optimizer: schema.Optimizer
     trainer: TrainerSettings
     logger: LoggerSettings
     evaluation: EvaluationSettings

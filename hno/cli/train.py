@@ -13,7 +13,6 @@ import lightning as L
 from hno.cli import launch
 from hno.cli.arguments import Arguments
 from hno.cli.build import build, check, how_to_train
-from hno.cli.checkpoints import resumed
 from hno.cli.evaluate import describe, play_starts, solve_tests, unseen_types
 from hno.cli.logs import StepBar, StepLines, label_progress, loggers, use_threads
 from hno.cli.media import publish
@@ -24,9 +23,9 @@ from hno.data.certificates import safe_sets, summaries
 from hno.data.datamodule import GameData
 from hno.data.labels import Request, default_cache, safe_labels_for
 from hno.games.grid import parse_types
-from hno.training.checkpoint import Provenance, check_resumable, load_policy, record
+from hno.training.checkpoint import Provenance, check_resumable, find_checkpoint, load_policy, record
 from hno.training.divergence import DivergedError
-from hno.training.fit import Fitted, fit
+from hno.training.fit import LAST, Fitted, fit
 from hno.training.validation import BEST, PROBE, Later
 from hno.types import Extremal
 
@@ -72,7 +71,7 @@ def train_operator(settings: TrainSettings, folder: Path, results: Results) -> F
     architecture, operator, objective, data = build(settings, label_progress())
     origin = Provenance(settings.operator["name"], data.type_list, settings.seed, config_hash(settings))
     entries, makers = record(data.game, architecture, origin), loggers(settings, folder)
-    resume = None if settings.resume is None else resumed(settings.resume)
+    resume = None if settings.resume is None else find_checkpoint(settings.resume, [LAST])
     if resume is not None:
         check_resumable(resume, entries)
     _take_over(None if resume is None else resume.parent / BEST, folder / BEST)

@@ -199,7 +199,10 @@ def test_resuming_from_something_else(command: Command, tmp_path: Path, random_c
     refused(command("train", *SMOKE, "resume=/nowhere/last.ckpt"), "There is no checkpoint at /nowhere/last.ckpt")
     refused(command("train", *SMOKE, "game=drone", f"resume={random_checkpoint}"), "'narrow_road', expected 'drone'")
     refused(command("train", *SMOKE, "network.width=8", f"resume={random_checkpoint}"), "architecture.network.options")
-    refused(command("train", *SMOKE, f"resume={tmp_path}"), f"There is no checkpoint at {tmp_path}/last.ckpt")
+    (tmp_path / "empty").mkdir()
+    refused(
+        command("train", *SMOKE, f"resume={tmp_path}/empty"), f"There is no checkpoint at {tmp_path}/empty/last.ckpt"
+    )
     foreign = tmp_path / "foreign.ckpt"
     foreign.write_bytes(b"these are no weights")
     refused(command("train", *SMOKE, f"resume={foreign}"), "not a readable checkpoint")

@@ -13,7 +13,7 @@ import hno
 from hno import registry
 from hno.cli import launch
 from hno.cli.calls import train_settings
-from hno.cli.parts import REGISTRIES
+from hno.cli.schema import REGISTRIES
 from hno.data.sources import BoxSource, Known, Source
 from hno.games import Game, games
 from hno.games.testing import check_game
