@@ -27,7 +27,7 @@ from rich.table import Table
 
 from hno.cli.calls import train_settings
 from hno.cli.results import Results, config_hash
-from hno.cli.schema import TrainSettings
+from hno.cli.settings import TrainSettings
 from hno.cli.train import train_operator
 from hno.control import Feedback
 from hno.control.rollout import rollout

@@ -22,7 +22,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from hno.cli.build import build_data, build_game
+from hno.cli.build import build
 from hno.cli.calls import train_settings
 from hno.cli.results import Results
 from hno.cli.train import train_operator
@@ -33,7 +33,7 @@ def measure(game: str, seed: int, starts: int, threads: int, overrides: list[str
     """One game and seed."""
     fixed = [f"game={game}", f"seed={seed}", f"validation.starts={starts}", f"trainer.threads={threads}", "logger=csv"]
     settings = train_settings(["experiment=fast", *fixed, *overrides])
-    data = build_data(settings, build_game(settings.game), frozenset({"bvp"}))
+    data = build(settings).data
     with tempfile.TemporaryDirectory() as folder:
         found, labels = labels_for(data.game, data.requests, Path(folder))
     with tempfile.TemporaryDirectory() as folder:

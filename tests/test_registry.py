@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 import hno
-from hno.cli.kinds import REGISTRIES
+from hno.cli.schema import REGISTRIES
 from hno.data import make_sampler
 from hno.games import make
 from hno.operators import Architecture, make_operator
@@ -242,7 +242,7 @@ def test_every_group_takes_an_installed_package(tmp_path):
     subprocess.run([*pip, "--target", site, source], check=True, capture_output=True, text=True)
     path = os.pathsep.join([str(site), str(Path(hno.__file__).parent.parent)])
     code = (
-        "from hno.cli.kinds import REGISTRIES\n"
+        "from hno.cli.schema import REGISTRIES\n"
         "for kind, registry in REGISTRIES.items():\n"
         "    print(kind, *registry().describe('foreign'), registry().group, sep='|')"
     )

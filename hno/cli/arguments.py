@@ -8,18 +8,18 @@ from typing import NamedTuple
 
 from hno.registry import unknown_name
 
-FLAGS = {"-h": "--help", "--help": "--help", "--version": "--version", "--dry-run": "--dry-run"}
-VALUE_FLAGS = {"--to": "--to"}
-HYDRA_FLAGS = {
-    "-m": "--multirun", "--multirun": "--multirun", "-sc": "--shell-completion", "--resolve": "--resolve",
-    "--shell-completion": "--shell-completion", "--hydra-help": "--hydra-help",
-}  # fmt: skip
-HYDRA_VALUE_FLAGS = {
-    "-cd": "--config-dir", "--config-dir": "--config-dir", "-c": "--cfg", "--cfg": "--cfg", "-p": "--package",
-    "--package": "--package", "-i": "--info", "--info": "--info",
-}  # fmt: skip
-KNOWN = FLAGS | VALUE_FLAGS | HYDRA_FLAGS | HYDRA_VALUE_FLAGS
-"""Every flag and its long form."""
+FLAGS = {
+    "--dry-run": "print the configuration (with -m: the jobs) after it has been checked, and end",
+    "--to": "PATH: where results go",
+    "--multirun": "(or -m) run every combination of values that are separated by commas; anywhere on the line",
+    "--config-dir": "FOLDER: choices of your own, such as FOLDER/experiment/mine.yaml",
+    "--help": "this text",
+    "--version": "hno's version",
+    "--shell-completion": "install=SHELL, for its eval: completion of keys and choices",
+}
+"""Every flag, anywhere on the line."""
+SHORT = {"-h": "--help", "-m": "--multirun", "-cd": "--config-dir", "-sc": "--shell-completion"}
+WITH_VALUE = ("--to", "--config-dir")
 TYPES = re.compile(r"""(\+*(?:theta|unseen|(?:\w+\.)*types)=)([-+.\d][^'"\[\]{}$]*[,;][^'"\[\]{}$]*)""")
 """Player types as a list of numbers, which Hydra's grammar takes in quotes only."""
 
@@ -41,12 +41,6 @@ class Arguments(NamedTuple):
     flags: dict[str, str]
     """Long forms and values; those without a value have ""."""
 
-    @property
-    def hydra(self) -> list[str]:
-        """The flags that are Hydra's."""
-        given = {name: self.flags[name] for name in self.flags if name in HYDRA_FLAGS or name in HYDRA_VALUE_FLAGS}
-        return [word for name, value in given.items() for word in (name, *([value] if value else []))]
-
 
 def parse(given: Sequence[str]) -> Arguments:
     """Sort words into flags, overrides and others.
@@ -61,13 +55,14 @@ def parse(given: Sequence[str]) -> Arguments:
         if not word.startswith("-"):
             (found.overrides if equals or word.startswith("~") else found.words).append(word)
             continue
-        if name not in KNOWN:
-            raise UsageError(unknown_name("flag", name, sorted(KNOWN)))
-        if not equals and (name in VALUE_FLAGS or name in HYDRA_VALUE_FLAGS):
+        flag = SHORT.get(name, name)
+        if flag not in FLAGS:
+            raise UsageError(unknown_name("flag", name, [*FLAGS]))
+        if not equals and flag in WITH_VALUE:
             if not rest:
                 raise UsageError(f"{name} needs a value.")
             value = rest.pop(0)
-        found.flags[KNOWN[name]] = value
+        found.flags[flag] = value
     return found
 
 

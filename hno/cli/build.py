@@ -4,26 +4,33 @@ from __future__ import annotations
 
 import warnings
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 from omegaconf import DictConfig
 
-from hno.cli.checkpoints import resumed
 from hno.cli.config import read
 from hno.cli.evaluate import check_evaluation, unseen_types
-from hno.cli.results import plain
-from hno.cli.schema import GameSettings, TrainSettings
-from hno.cli.starts import cache_folder
+from hno.cli.settings import TrainSettings
 from hno.data import Collocation, GameData, LabelPlan, make_sampler
 from hno.data.curriculum import Curriculum
-from hno.data.labels import Report
+from hno.data.labels import Report, default_cache
 from hno.evaluation.ntk import check_rows
 from hno.games import Game, make
 from hno.games.grid import parse_types
 from hno.losses import Objective, make_objective
-from hno.operators import Architecture, Choice, make_operator
-from hno.training.fit import Settings
+from hno.operators import Architecture, Choice, ValueOperator, make_operator
+from hno.training.checkpoint import find_checkpoint
+from hno.training.fit import LAST, Settings
 from hno.training.optimizers import make_optimizer
+
+
+class Built(NamedTuple):
+    """The objects of a training."""
+
+    architecture: Architecture
+    operator: ValueOperator
+    objective: Objective
+    data: GameData
 
 
 def check(config: DictConfig) -> TrainSettings:
@@ -34,73 +41,65 @@ def check(config: DictConfig) -> TrainSettings:
     """
     settings = read(TrainSettings, config)
     with warnings.catch_warnings(action="ignore"):  # the run warns
-        game = build_game(settings.game)
+        built = build(settings)
+        game = built.data.game
         check_evaluation(game, settings.evaluation)
         unseen_types(game, settings.evaluation.types, "evaluation.types")
         if settings.validation.types is not None:
             parse_types(game, settings.validation.types, key="validation.types")
-        operator, objective = make_operator(game, build_architecture(settings)), build_objective(settings)
-        build_data(settings, game, objective.streams(exact_terminal=operator.meets_terminal))
         make_optimizer(steps=settings.trainer.max_steps, **settings.optimizer)
         if settings.evaluation.ntk:
-            check_rows(operator, settings.evaluation.ntk_rows)
+            check_rows(built.operator, settings.evaluation.ntk_rows)
     if settings.resume is not None:
-        resumed(settings.resume)
+        find_checkpoint(settings.resume, [LAST])
     return settings
 
 
-def build_game(settings: GameSettings) -> Game:
-    """The chosen game with its changed constants."""
-    return make(settings.name, **settings.constants)
+def build(settings: TrainSettings, report: Report | None = None) -> Built:
+    """The chosen game, operator, method and data; labels are not solved yet.
+
+    Args:
+        settings: of the training.
+        report: is told how many labels are solved.
+    """
+    game, function = make(settings.game.name, **settings.game.constants), dict(settings.operator)
+    function["name"] = function.pop("function")
+    parts = [dict(part) for part in (function, settings.network, settings.activation)]
+    architecture = Architecture(*(Choice(part.pop("name"), part) for part in parts))
+    operator, objective = make_operator(game, architecture), make_objective(**settings.loss.model_dump())
+    needed = objective.streams(exact_terminal=operator.meets_terminal)
+    plans = _labels(settings, game), _collocation(settings)
+    sizes = settings.data.batch_sizes.model_dump()
+    return Built(architecture, operator, objective, GameData(game, needed, settings.seed, *plans, sizes, report))
 
 
-def build_architecture(settings: TrainSettings) -> Architecture:
-    """What the operator is built of."""
-    options = {name: value for name, value in settings.operator.items() if name not in ("name", "function")}
-    function = Choice(settings.operator["function"], options)
-    return Architecture(function, _choice(settings.network), _choice(settings.activation))
-
-
-def _choice(content: dict[str, Any]) -> Choice:
-    return Choice(content["name"], {name: value for name, value in content.items() if name != "name"})
-
-
-def build_objective(settings: TrainSettings) -> Objective:
-    """The method: loss terms and weights."""
-    return make_objective(**plain(settings.loss))
-
-
-def build_data(settings: TrainSettings, game: Game, needed: frozenset[str], report: Report | None = None) -> GameData:
-    """The streams that the objective's terms read."""
-    data, steps = settings.data, settings.trainer.max_steps
-    finish = round((1 - data.finish) * steps) if data.finish else None
-    curriculum = Curriculum(round(data.pretrain * steps), round(data.widening * steps), finish)
+def _labels(settings: TrainSettings, game: Game) -> LabelPlan:
+    data = settings.data
     none = data.types in (None, []) and data.files  # those of the files alone
-    labels = LabelPlan(
+    return LabelPlan(
         types=() if none else parse_types(game, data.types),
         trajectories=data.trajectories,
         validation=data.validation,
         files=[Path(file) for file in data.files],
-        cache=cache_folder(data.cache),
+        cache=Path(data.cache or default_cache()),
         workers=data.workers,
     )
-    collocation = Collocation(make_sampler(settings.sampler), curriculum, data.interior_types)
-    return GameData(game, needed, settings.seed, labels, collocation, plain(data.batch_sizes), report)
 
 
-def build_settings(settings: TrainSettings) -> Settings:
-    """How to train."""
-    trainer = settings.trainer
+def _collocation(settings: TrainSettings) -> Collocation:
+    data, steps = settings.data, settings.trainer.max_steps
+    finish = round((1 - data.finish) * steps) if data.finish else None
+    curriculum = Curriculum(round(data.pretrain * steps), round(data.widening * steps), finish)
+    return Collocation(make_sampler(settings.sampler), curriculum, data.interior_types)
+
+
+def how_to_train(settings: TrainSettings) -> Settings:
+    """How to train; entries of `trainer` have the names of the fields."""
+    shared = {name: value for name, value in settings.trainer if name in Settings.__dataclass_fields__}
     return Settings(
-        steps=trainer.max_steps,
+        steps=settings.trainer.max_steps,
         optimizer=settings.optimizer,
-        validate_every=trainer.validate_every,
         stop_when_safe=settings.validation.stop_when_safe,
         dt=settings.evaluation.dt,
-        accelerator=trainer.accelerator,
-        devices=trainer.devices,
-        precision=trainer.precision,
-        gradient_clip_val=trainer.gradient_clip_val,
-        polish=trainer.polish,
-        compile=trainer.compile,
+        **shared,
     )

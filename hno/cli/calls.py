@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import tempfile
-import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from hno.cli import evaluate as evaluation
 from hno.cli.arguments import Arguments
 from hno.cli.build import check
-from hno.cli.config import compose, for_hydra, groups, quoted, register_plugins
-from hno.cli.evaluate import check as check_evaluation
-from hno.cli.evaluate import checkpoints_of, evaluate_models
-from hno.cli.results import Results
-from hno.cli.schema import TrainSettings
-from hno.cli.train import train_operator
+from hno.cli.config import compose, for_hydra, groups, quoted
+from hno.cli.logs import quiet_lightning
+from hno.cli.results import Results, recorded
+from hno.cli.settings import TrainSettings
+from hno.cli.train import head, train_operator
 from hno.games import Game, games
 from hno.training.checkpoint import LearnedPolicy, load_policy
 
@@ -47,14 +46,9 @@ def train(
     checked = train_settings(_overrides("train", chosen))
     place = Path(folder)
     place.mkdir(parents=True, exist_ok=True)
-    warnings.filterwarnings("ignore", message=".*exists and is not empty")  # results.json is there first
-    results = Results(place / "results.json", {"game": name, "operator": method, "seed": checked.seed})
-    try:
+    results = Results(place / "results.json", head(checked))
+    with quiet_lightning(), recorded(results):
         fitted = train_operator(checked, place, results)
-    except BaseException as error:
-        results.update(status="failed", reason=f"{type(error).__name__}: {error}")
-        raise
-    results.update(status="finished")
     return load_policy(fitted.checkpoint)
 
 
@@ -75,21 +69,19 @@ def evaluate(
         ValueError, LookupError: settings that are unknown or make no sense.
         CheckpointError: a checkpoint that cannot be read.
     """
-    chosen = {"checkpoint": str(checkpoint), **(settings or {})}
-    register_plugins()
-    given = Arguments([], _overrides("evaluate", chosen), {})
-    checked = check_evaluation(compose("evaluate", for_hydra("evaluate", given)))
+    chosen = _overrides("evaluate", {"checkpoint": str(checkpoint), **(settings or {})})
+    checked = evaluation.check(compose("evaluate", for_hydra("evaluate", Arguments([], chosen, {}))))
     with tempfile.TemporaryDirectory() as nowhere:
         place = Path(nowhere if folder is None else folder)
         place.mkdir(parents=True, exist_ok=True)
-        results = Results(place / "results.json", {"checkpoint": str(checkpoint)})
-        evaluate_models(checked, list(map(str, checkpoints_of(checked))), results)
+        results = Results(place / "results.json", evaluation.head(checked))
+        with recorded(results):
+            evaluation.evaluate(checked, results)
     return results.content
 
 
 def train_settings(overrides: Sequence[str]) -> TrainSettings:
     """The checked settings of a training, from overrides as on the command line. Raises as `train`."""
-    register_plugins()
     return check(compose("train", for_hydra("train", Arguments([], list(overrides), {}))))
 
 

@@ -18,12 +18,13 @@ def run(given: Arguments) -> int:
     """`hno check-game NAME|MODULE:CLASS`."""
     if len(given.words) != 1:
         raise UsageError("Name one game: a registered name, or module:Class of a file in this folder.")
+    from hno.games import make
     from hno.games.testing import ContractError, check_game
 
     use_threads(1)
     name, constants = given.words[0], _constants(given.overrides)
     try:
-        game = _game(name, constants)
+        game = _class(name)(**constants) if ":" in name else make(name, **constants)
         check_game(game)
     except Exception as error:  # whatever a file of the user's raises
         kind = "" if isinstance(error, (ContractError, LookupError)) else f"{type(error).__name__}: "
@@ -36,12 +37,11 @@ def run(given: Arguments) -> int:
     return 0
 
 
-def _game(name: str, constants: dict[str, Any]) -> Any:
-    from hno.games import Game, make
+def _class(name: str) -> Any:
+    """The class of a file in this folder."""
+    from hno.games import Game
 
-    module, colon, cls = name.partition(":")
-    if not colon:
-        return make(name, **constants)
+    module, _, cls = name.partition(":")
     sys.path.insert(0, str(Path.cwd()))
     try:
         found = getattr(importlib.import_module(module), cls, None)
@@ -49,14 +49,14 @@ def _game(name: str, constants: dict[str, Any]) -> Any:
         sys.path.remove(str(Path.cwd()))
     if not (isinstance(found, type) and issubclass(found, Game)):
         raise UnknownNameError(f"{module} has no class {cls!r} that is a Game.")
-    return found(**constants)
+    return found
 
 
-def _constants(overrides: list[str]) -> dict[str, Any]:
+def _constants(overrides: list[str]) -> Any:
     from omegaconf import OmegaConf
 
     wrong = [override for override in overrides if not override.lstrip("+").startswith(PREFIX)]
     if wrong:
         raise UsageError(f"{wrong[0]}: a game takes {PREFIX}<name>=<value> only.")
-    given = OmegaConf.from_dotlist([override.lstrip("+").removeprefix(PREFIX) for override in overrides])
-    return {str(name): value for name, value in (OmegaConf.to_object(given) or {}).items()}  # type: ignore[union-attr]
+    given = [override.lstrip("+").removeprefix(PREFIX) for override in overrides]
+    return OmegaConf.to_object(OmegaConf.from_dotlist(given)) if given else {}

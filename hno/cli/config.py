@@ -7,7 +7,7 @@ import inspect
 import os
 import re
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
@@ -17,15 +17,15 @@ from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.plugins import Plugins
-from hydra.errors import HydraException, OverrideParseException
+from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 import hno
 from hno.cli.arguments import Arguments, UsageError, rewritten
-from hno.cli.kinds import GIVEN, REGISTRIES
-from hno.cli.schema import S, SettingsError, validated
+from hno.cli.schema import GIVEN, REGISTRIES, S, SettingsError, validated
+from hno.cli.settings import TrainSettings
 from hno.registry import options_of, plural, unknown_name
 
 CHOSEN = ("game", "operator", "network", "activation", "optimizer")
@@ -68,11 +68,6 @@ def groups(name: str) -> list[str]:
     return [str(group) for entry in defaults if OmegaConf.is_dict(entry) for group in entry]
 
 
-def folders() -> set[str]:
-    """Names of all groups that there are."""
-    return {path.name for folder in Folders.all() for path in folder.iterdir() if path.is_dir()}
-
-
 def choices(group: str) -> dict[str, Path | None]:
     """Choices of a group and their files; those of plugins without a file have none. Nothing is imported."""
     found: dict[str, Path | None] = {}
@@ -89,101 +84,84 @@ def register_plugins() -> None:
         for name in registry.names():
             if have.get(name) is None and (group, name) != ("operator", "gradient"):  # that of our own methods
                 options = options_of(registry.get(name), skip=GIVEN.get(group, ()))
-                node = _NODES.get(group, dict)({"name": name, **_writable(options)})
-                package = "_global_" if group in _NODES else None
-                ConfigStore.instance().store(group=group, name=name, node=node, package=package)
+                package = "_global_" if group == "operator" else group
+                ConfigStore.instance().store(group=group, name=name, node=_node(group, name, options), package=package)
 
 
-def _writable(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Defaults that yaml can hold; an option without a default must be given."""
-    found = {name: "???" if value is inspect.Parameter.empty else value for name, value in options.items()}
-    return {k: list(v) if isinstance(v, tuple) else v for k, v in found.items() if isinstance(v, _PLAIN)}
-
-
-def _game(node: dict[str, Any]) -> dict[str, Any]:
-    """A game with all constants that are numbers."""
-    constants = {key: value for key, value in node.items() if type(value) in (int, float)}
-    return {"game": {"name": node["name"], "constants": constants}}
-
-
-def _method(node: dict[str, Any]) -> dict[str, Any]:
-    """A method whose function is a plugin: the terms are those of `operator=hno`."""
-    content = OmegaConf.to_container(OmegaConf.load(config_dir() / "operator" / "hno.yaml"))
-    assert isinstance(content, dict)
-    return {"operator": {"function": node["name"], **node}, "loss": content["loss"]}
-
-
-_PLAIN = (bool, int, float, str, tuple, list, dict, type(None))
-_NODES: Mapping[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
-    "game": _game,
-    "operator": _method,
-    "optimizer": lambda node: {"optimizer": {"lr": 3e-3, "schedule": "cosine", "final_lr": 3e-5, **node}},
-}
-"""Groups whose nodes are more than a name and options."""
-
-
-def check_choices(name: str, overrides: Sequence[str]) -> None:
-    """Refuse group choices that do not exist. Registries are imported for choices without a file only.
-
-    Raises:
-        UsageError: a choice does not exist; the message has the known ones and the nearest.
-    """
-    composed = groups(name)
-    for override in overrides:
-        match = re.fullmatch(r"\+*([a-z_]+)=([\w.,-]+)", override)
-        if match is None or match[1] not in composed:
-            continue
-        group, known = match[1], choices(match[1])
-        wanted = {choice for choice in match[2].split(",") if choice != "null" and known.get(choice) is None}
-        if not wanted:
-            continue
-        register_plugins()
-        names = {*known, *(REGISTRIES[group]().names() if group in CHOSEN else ())}
-        for choice in sorted(wanted - names):
-            raise UsageError(unknown_name(group, choice, sorted(names)))
+def _node(group: str, name: str, options: Mapping[str, Any]) -> Any:
+    """What would stand in a file: defaults that yaml can hold; an option without a default must be given."""
+    if group == "game":
+        return {"name": name, "constants": {key: v for key, v in options.items() if type(v) in (int, float)}}
+    found = {key: "???" if value is inspect.Parameter.empty else value for key, value in options.items()}
+    plain = (bool, int, float, str, tuple, list, dict, type(None))
+    node = {"name": name, **{k: list(v) if type(v) is tuple else v for k, v in found.items() if isinstance(v, plain)}}
+    if group == "optimizer":
+        return {"lr": 3e-3, "schedule": "cosine", "final_lr": 3e-5, **node}
+    if group == "operator":  # with the terms of `operator=hno`
+        return {"operator": {"function": name, **node}, "loss": OmegaConf.load(config_dir() / "operator/hno.yaml").loss}
+    return node
 
 
 def for_hydra(name: str, given: Arguments) -> list[str]:
     """Overrides as Hydra takes them, after the user's folder and the plugins are known to it.
 
     Raises:
-        UsageError: a choice that does not exist, or a folder of configurations that does not.
+        UsageError: a folder of configurations that does not exist.
     """
     folder = given.flags.get("--config-dir")
     if folder is not None and not Path(folder).is_dir():
         raise UsageError(f"--config-dir: there is no folder {folder}.")
     Folders.own = [] if folder is None else [Path(folder)]
     Plugins.instance().register(Folders)
-    check_choices(name, given.overrides)
-    composed, untouched = groups(name), folders()
-    if "--multirun" in given.flags:
-        untouched |= _swept(name, [override for override in given.overrides if override.startswith("experiment=")])
-    return [rewritten(override, composed, untouched) for override in given.overrides]
+    swept: Collection[str] = ()
+    if "--multirun" in given.flags:  # Hydra lets the command line narrow an experiment's sweep under the same name only
+        compose(name, [override for override in given.overrides if override.startswith("experiment=")])
+        swept = HydraConfig.get().sweeper.params or ()
+    composed = groups(name)
+    return [rewritten(override, composed, swept) for override in given.overrides]
 
 
-def _swept(name: str, experiment: Sequence[str]) -> set[str]:
-    """Keys that an experiment sweeps over: Hydra lets the command line narrow them under the same name only."""
-    compose(name, experiment)
-    return set(HydraConfig.get().sweeper.params or ())
+def compose(name: str, overrides: Sequence[str], *, registered: bool = False) -> DictConfig:
+    """A configuration as Hydra composes it, without a job; interpolations that name `hydra` work.
 
+    Args:
+        name: the root configuration.
+        overrides: as Hydra takes them.
+        registered: whether registered classes are known to Hydra; otherwise they are looked up for a choice without a
+            file only.
 
-def compose(name: str, overrides: Sequence[str]) -> DictConfig:
-    """A configuration as Hydra composes it, without a job; interpolations that name `hydra` work."""
+    Raises:
+        SettingsError: Hydra cannot compose it.
+    """
     try:
         with hydra.initialize_config_dir(str(config_dir()), version_base="1.3"):
             config = hydra.compose(name, overrides=list(overrides), return_hydra_config=True)
-    except OverrideParseException as error:
-        raise SettingsError(f"{error.override} cannot be read: {str(error).splitlines()[0]}.") from error
+    except HydraException as error:
+        if registered or not isinstance(error, MissingConfigException):
+            raise SettingsError(sentence(error)) from error
+        register_plugins()
+        return compose(name, overrides, registered=True)
     HydraConfig.instance().set_config(config)
     OmegaConf.set_struct(config, False)
     del config["hydra"]
     return config
 
 
+def sentence(error: Exception) -> str:
+    """What an error means: of Hydra's, choices that do not exist and overrides that cannot be read."""
+    if isinstance(error, MissingConfigException) and error.missing_cfg_file is not None:
+        group, _, choice = error.missing_cfg_file.rpartition("/")
+        return unknown_name("method" if group == "operator" else group, choice, sorted(error.options or ()))
+    if isinstance(error, OverrideParseException):
+        return f"{error.override} cannot be read: {str(error).splitlines()[0]}."
+    return str(error)
+
+
 def read(model: type[S], config: DictConfig) -> S:
     """The composed configuration, judged by the schema of its command.
 
-    Top-level entries that an experiment's file declares for its own interpolations are no part of it.
+    Top-level entries that an experiment's file declares for its own interpolations are no part of it, nor is what a
+    game's file says for trainings where the command does not train.
 
     Raises:
         SettingsError: see `hno.cli.schema.validated`.
@@ -191,36 +169,25 @@ def read(model: type[S], config: DictConfig) -> S:
     hydra_config = HydraConfig.get()
     chosen = hydra_config.runtime.choices.get("experiment")
     files = [folder / "experiment" / f"{chosen}.yaml" for folder in Folders.all()]
-    helpers = {key for file in files if file.exists() for key in OmegaConf.load(file)} - model.model_fields.keys()
+    helpers = {key for file in files if file.exists() for key in OmegaConf.load(file)}
     given = {override.partition("=")[0].lstrip("+~") for override in hydra_config.overrides.task}
-    known = {key: value for key, value in _content(config).items() if key not in helpers and value != "???"}
-    return validated(model, known, given)
+    others = TrainSettings.model_fields.keys() - {key.split(".")[0] for key in given}
+    unread = (helpers | others) - model.model_fields.keys()
+    try:
+        content: Any = OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
+    except OmegaConfBaseException as error:
+        raise SettingsError(str(error)) from error
+    return validated(model, {k: v for k, v in content.items() if k not in unread and v != "???"}, given)
 
 
-def _content(config: DictConfig) -> dict[str, Any]:
-    content = OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
-    assert isinstance(content, dict)
-    return {str(key): value for key, value in content.items()}
-
-
-def configured(name: str, model: type[S], given: Arguments) -> S | None:
-    """The settings of a command without jobs; None after a dry run, which prints them.
-
-    What a game's file says for other commands is left out.
+def configured(name: str, check: Callable[[DictConfig], S], given: Arguments) -> S | None:
+    """The settings of a command; None after a dry run, which prints them.
 
     Raises:
-        ValueError: a configuration that cannot be composed, or one that the schema refuses.
+        ValueError: a configuration that cannot be composed.
+        Exception: what `check` raises.
     """
-    overrides = for_hydra(name, given)
-    try:
-        config = compose(name, overrides)
-        chosen = [override for override in overrides if override.split("=")[0] in groups(name)]
-        for key, value in _content(compose(name, chosen)).items():
-            if key not in model.model_fields and _content(config)[key] == value:
-                del config[key]
-        settings = read(model, config)
-    except (HydraException, OmegaConfBaseException) as error:
-        raise SettingsError(str(error)) from error
+    settings = check(compose(name, for_hydra(name, given)))
     if "--dry-run" not in given.flags:
         return settings
     print(OmegaConf.to_yaml(OmegaConf.create(settings.model_dump())), end="")
@@ -243,8 +210,7 @@ def under_hydra(name: str, job: Callable[[DictConfig], Any], words: Sequence[str
         sys.argv = before
 
 
-def hydras_own(name: str, given: Arguments) -> int:
-    """What Hydra does by itself: shell completion, and its help."""
+def complete(name: str, words: Sequence[str]) -> None:
+    """Hydra's own completion for shells."""
     Plugins.instance().register(Folders)
-    under_hydra(name, lambda config: None, [*given.hydra, *given.overrides])
-    return 0
+    under_hydra(name, lambda config: None, ["--shell-completion", *words])

@@ -2,48 +2,46 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import torch
-from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from hno.cli import launch
 from hno.cli.arguments import Arguments
-from hno.cli.checkpoints import trained
 from hno.cli.config import read
-from hno.cli.logs import send_lightning_to_hydra, use_threads
-from hno.cli.media import draw_typical
-from hno.cli.results import Results, config_hash, plain, write_json
-from hno.cli.schema import Episodes, EvaluateSettings
+from hno.cli.logs import label_progress, use_threads
+from hno.cli.media import draw_typical, title_of
+from hno.cli.results import Results, config_hash, write_json
 from hno.cli.sections import chosen_sections, run_sections
-from hno.cli.starts import cache_folder, label_solver
-from hno.cli.summary import report, show
+from hno.cli.settings import Episodes, EvaluateSettings
 from hno.control.rollout import control_steps
+from hno.data.labels import Request, default_cache, labels_for, safe_labels_for
 from hno.evaluation.closed_loop import CollisionTable, play
 from hno.evaluation.comparison import PairedComparison, check_same_game
 from hno.evaluation.conditions import table_condition
 from hno.evaluation.episodes import EPISODES, episodes
 from hno.evaluation.sections import Evaluation
 from hno.games import Game
-from hno.games.grid import parse_types
-from hno.training.checkpoint import LearnedPolicy, load_policy
+from hno.games.grid import parse_types, quarter_types
+from hno.training.checkpoint import LearnedPolicy, find_checkpoint, load_policy
 from hno.types import Extremal
 
 log = logging.getLogger(__name__)
 
 Types = tuple[float, ...]
 """One type per player."""
+Table = list[dict[str, Any]]
 
 
 def run(given: Arguments) -> int:
     """`hno evaluate`."""
-    return launch.run("evaluate", check, evaluate, given)
+    return launch.run(launch.Task("evaluate", check, head, evaluate), given)
 
 
 def check(config: DictConfig) -> EvaluateSettings:
@@ -55,85 +53,77 @@ def check(config: DictConfig) -> EvaluateSettings:
     """
     settings = read(EvaluateSettings, config)
     with warnings.catch_warnings(action="ignore"):  # the run warns
-        policies, types = load(settings)
-        for evaluation in describe(settings, list(map(str, checkpoints_of(settings))), policies, types):
+        for evaluation in prepared(settings)[1]:
             for section in chosen_sections(evaluation.options).values():
                 section.check(evaluation)
     return settings
 
 
-def describe(
-    settings: EvaluateSettings, names: Sequence[str], policies: Sequence[LearnedPolicy], types: Sequence[Types]
-) -> list[Evaluation]:
-    """The evaluation of every model, before its labels are solved."""
-    options = plain(settings)
-    solve = label_solver(policies[0].game, types, options, cache_folder(settings.cache), settings.workers)
-    pairs = zip(names, policies, strict=True)
-    return [Evaluation(name, policy, policy.types, types, options, solve) for name, policy in pairs]
+def head(settings: EvaluateSettings) -> dict[str, Any]:
+    """What results.json says from the beginning."""
+    first = str(find_checkpoint(settings.checkpoint[0]))
+    return {"checkpoint": first, "config_hash": config_hash(settings), "config": settings.model_dump()}
 
 
-def load(settings: EvaluateSettings) -> tuple[list[LearnedPolicy], list[tuple[float, ...]]]:
-    """The models to evaluate and the types at which to do so. Raises as `check`."""
-    paths = checkpoints_of(settings)
+def prepared(settings: EvaluateSettings) -> tuple[list[LearnedPolicy], list[Evaluation]]:
+    """The models and their evaluations, before labels are solved. Raises as `check`."""
+    paths = [str(find_checkpoint(path)) for path in settings.checkpoint]
     policies = [load_policy(path, settings.expected_game) for path in paths]
-    check_same_game(list(map(str, paths)), [policy.game for policy in policies])
+    check_same_game(paths, [policy.game for policy in policies])
     check_evaluation(policies[0].game, settings)
-    chosen = [types_to_evaluate(settings.theta, policy, settings.unseen) for policy in policies]
-    return policies, list(dict.fromkeys(theta for own in chosen for theta in own))
+    types = [theta for one in policies for theta in types_to_evaluate(settings.theta, one, settings.unseen)]
+    models = list(zip(paths, policies, strict=True))
+    return policies, describe(models, types, settings.model_dump(), settings.cache, settings.workers)
 
 
-def evaluate(settings: EvaluateSettings) -> bool:
-    """Evaluate checkpoints and write results.json into the run's own folder.
+def describe(
+    models: Sequence[tuple[str, LearnedPolicy]],
+    types: Sequence[Types],
+    options: Mapping[str, Any],
+    cache: str | None,
+    workers: int | None,
+) -> list[Evaluation]:
+    """The evaluation of models of one game, by the path of each checkpoint.
 
-    Returns:
-        Whether it succeeded. A failure has been logged and is in results.json.
+    Labels of the starts depend on the game, the types and the options `starts`, `seed`, `safe` and `clearance` alone:
+    every model meets the same ones. Equal starts have the same labels, the same object.
     """
-    send_lightning_to_hydra()
-    folder, paths = Path(HydraConfig.get().runtime.output_dir), list(map(str, checkpoints_of(settings)))
-    head = {"checkpoint": paths[0], "config_hash": config_hash(settings), "config": plain(settings)}
-    results = Results(folder / "results.json", head)
-    try:
-        evaluate_models(settings, paths, results)
-    except Exception as error:
-        results.update(status="failed", reason=f"{type(error).__name__}: {error}")
-        report(error)
-        return False
-    except (KeyboardInterrupt, SystemExit):  # Lightning turns the one into the other
-        results.update(status="failed", reason="interrupted")
-        raise
-    show(results.content, folder)
-    return True
+    game, types = models[0][1].game, list(dict.fromkeys(types))
+    solver = functools.partial(safe_labels_for, clearance=options["clearance"]) if options["safe"] else labels_for
+
+    @functools.cache
+    def solve(widen: float, symmetric: bool) -> list[Extremal]:
+        requests = [Request(theta, options["starts"], options["seed"], "test", widen, symmetric) for theta in types]
+        return solver(game, requests, Path(cache or default_cache()), workers=workers, report=label_progress())[0]
+
+    return [
+        Evaluation(name, policy, policy.types, types, options, lambda condition: solve(*condition.starts))
+        for name, policy in models
+    ]
 
 
-def checkpoints_of(settings: EvaluateSettings) -> list[Path]:
-    """Files of the models: one, or several of a list."""
-    given = settings.checkpoint
-    return [trained(str(path)) for path in (given if isinstance(given, list) else [given])]
-
-
-def evaluate_models(settings: EvaluateSettings, paths: Sequence[str], results: Results) -> None:
-    """Evaluate the models of these files; every part is written into the results as it is done."""
+def evaluate(settings: EvaluateSettings, results: Results) -> None:
+    """Evaluate models; every part is written into the results as it is done."""
     use_threads(settings.threads)
-    policies, types = load(settings)
-    results.update(**policies[0].names(), seed=policies[0].provenance.seed)
-    evaluations = describe(settings, paths, policies, types)
-    labels = solve_tests(evaluations[0], results)
-    models, played = list[dict[str, Any]](), list[Evaluation]()
-    for policy, evaluation in zip(policies, evaluations, strict=True):
+    policies, evaluations = prepared(settings)
+    models: list[dict[str, Any]] = [
+        {"checkpoint": evaluation.name, **policy.names(), "seed": policy.provenance.seed}
+        for policy, evaluation in zip(policies, evaluations, strict=True)
+    ]
+    results.update(**models[0])
+    labels, played = solve_tests(evaluations[0], results), list[Evaluation]()
+    for model, evaluation in zip(models, evaluations, strict=True):
         log.info("evaluation of %s", evaluation.name)
-        found, table = (assess if models else evaluate_policy)(evaluation, labels, results)
+        found, model["table"] = play_starts(evaluation, labels, results)
         played.append(found)
-        names = {**policy.names(), "seed": policy.provenance.seed}
-        models.append({"checkpoint": evaluation.name, **names, "table": table})
         for name, content in run_sections(found, results):
-            models[-1][name] = content
+            model[name] = content
             results.update(**models[0])
     if len(models) > 1:
         results.update(models=models, comparison=PairedComparison().compute(played))
-    results.update(status="finished")
 
 
-def types_to_evaluate(choice: Any, policy: LearnedPolicy, unseen: Any = None) -> list[tuple[float, ...]]:
+def types_to_evaluate(choice: Any, policy: LearnedPolicy, unseen: Any = None) -> list[Types]:
     """Player types to evaluate a policy at.
 
     Default are the labelled types and those that `unseen` adds.
@@ -151,7 +141,7 @@ def types_to_evaluate(choice: Any, policy: LearnedPolicy, unseen: Any = None) ->
     return list(dict.fromkeys([*policy.types, *unseen_types(policy.game, unseen, "unseen")]))
 
 
-def unseen_types(game: Game, choice: Any, key: str) -> list[tuple[float, ...]]:
+def unseen_types(game: Game, choice: Any, key: str) -> list[Types]:
     """Types that are evaluated beside the labelled ones: the chosen ones, or four at quarters of the type box.
 
     Args:
@@ -159,15 +149,9 @@ def unseen_types(game: Game, choice: Any, key: str) -> list[tuple[float, ...]]:
         choice: what `parse_types` takes; None for the four.
         key: where the choice stands, for messages.
     """
-    if choice is not None:
-        return parse_types(game, choice, key=key) if choice else []
-    lo, width = game.type_box.lo, game.type_box.hi - game.type_box.lo
-    quarters = [[own, *[others] * (game.players - 1)] for own, others in QUARTERS]
-    return game.validate_types([(lo + width * torch.tensor(row) / 4).tolist() for row in quarters])
-
-
-QUARTERS = ((0, 1), (1, 1), (1, 3), (3, 4))
-"""Places in the type box, of the first player and of the others, in quarters of its edges."""
+    if choice is None:
+        return quarter_types(game)
+    return [] if choice == [] else parse_types(game, choice, key=key)
 
 
 def solve_tests(evaluation: Evaluation, results: Results) -> list[Extremal]:
@@ -179,35 +163,27 @@ def solve_tests(evaluation: Evaluation, results: Results) -> list[Extremal]:
     return labels
 
 
-Assessed = tuple[Evaluation, list[dict[str, Any]]]
-"""An evaluation with its episodes, and the rows of its table."""
+def play_starts(evaluation: Evaluation, labels: Sequence[Extremal], results: Results) -> tuple[Evaluation, Table]:
+    """Play from the starts of the labels. The first model's table goes into the results, and some episodes are kept.
 
-
-def evaluate_policy(evaluation: Evaluation, labels: Sequence[Extremal], results: Results) -> Assessed:
-    """Play from the starts of the labels, put the table into the results, keep some episodes and draw one."""
-    found, table = assess(evaluation, labels, results)
-    folder, game = results.path.parent, found.game
-    kept = episodes(game, found.played, labels, found.clearance)
-    write_json(folder / EPISODES, kept)
-    conditions = {name: found.options[name] for name in ("clearance", "dt", "widen", "noise", "delay")}
-    results.update(**conditions, constraint_unit=game.constraint_unit, table=table, episodes=EPISODES)
-    title = " / ".join(str(results.content[name]) for name in ("game", "operator", "activation"))
-    draw_typical(kept["episodes"], folder / "rollout.png", title)
-    return found, table
-
-
-def assess(evaluation: Evaluation, labels: Sequence[Extremal], results: Results) -> Assessed:
-    """Play from the starts of the labels."""
-    began = time.perf_counter()
-    disturbance = evaluation.condition.disturbance
-    played = play(evaluation.game, evaluation.policy, labels, evaluation.dt, disturbance)
+    Returns:
+        The evaluation with its episodes, and the rows of its table.
+    """
+    began, game, folder = time.perf_counter(), evaluation.game, results.path.parent
+    played = play(game, evaluation.policy, labels, evaluation.dt, evaluation.condition.disturbance)
     found = evaluation._replace(labels=labels, played=played)
     table = CollisionTable().compute(found)
     results.time("evaluation", time.perf_counter() - began)
+    if results.content["episodes"] is None:
+        kept = episodes(game, played, labels, found.clearance)
+        write_json(folder / EPISODES, kept)
+        conditions = {name: found.options[name] for name in ("clearance", "dt", "widen", "noise", "delay")}
+        results.update(**conditions, constraint_unit=game.constraint_unit, table=table, episodes=EPISODES)
+        draw_typical(kept["episodes"], folder / "rollout.png", title_of(results.content))
     return found, table
 
 
 def check_evaluation(game: Game, settings: Episodes) -> None:
     """Raise ValueError for entries that make no evaluation of the game."""
-    table_condition(game, plain(settings))
+    table_condition(game, settings.model_dump())
     control_steps(game, settings.dt)

@@ -9,7 +9,6 @@ from typing import Any
 
 import yaml  # type: ignore[import-untyped]  # yaml has no annotations
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
 from hno.cli.arguments import Arguments
@@ -25,7 +24,7 @@ def configuration_help(name: str, given: Arguments) -> str:
     overrides = for_hydra(name, given)
     try:
         config = compose(name, overrides)
-    except (HydraException, SettingsError):  # values of a sweep, or mistakes of which a run will speak
+    except SettingsError:  # values of a sweep, or mistakes of which a run will speak
         config = compose(name, [])
     said = dict(comments((config_dir() / f"{name}.yaml").read_text(encoding="utf-8")))
     parts = []
@@ -39,8 +38,20 @@ def configuration_help(name: str, given: Arguments) -> str:
             prefix = "" if "@package _global_" in text else f"{group}."
             said.update({prefix + key: comment for key, comment in comments(text)})
     head = "Groups, group=choice (*: chosen)\n" + "\n".join(parts) + "\n\n" if parts else ""
-    content: Any = OmegaConf.to_container(config, resolve=False)
-    return head + "Keys, key=value\n" + "\n".join(_keys(content, said))
+    text = yaml.dump(OmegaConf.to_container(config, resolve=False), Dumper=_Flow, sort_keys=False, width=10**6)
+    lines = [(f"  {line}".replace(": ???", ": (required)"), key) for line, key in _keyed(text)]
+    keys = [f"{line:<{BESIDE - 2}}  # {said[key]}" if key in said else line for line, key in lines]
+    return head + "Keys, key=value\n" + "\n".join(keys)
+
+
+class _Flow(yaml.SafeDumper):  # type: ignore[misc]  # yaml has no annotations
+    """Lists in one line each."""
+
+    def represent_list(self, data: list[Any]) -> Any:
+        return self.represent_sequence("tag:yaml.org,2002:seq", data, flow_style=True)
+
+
+_Flow.add_representer(list, _Flow.represent_list)
 
 
 def _group(group: str, known: Mapping[str, Path | None], chosen: object) -> str:
@@ -52,35 +63,22 @@ def _group(group: str, known: Mapping[str, Path | None], chosen: object) -> str:
     return "\n".join(lines)
 
 
-def _keys(content: Mapping[str, Any], said: Mapping[str, str], above: tuple[str, ...] = ()) -> Iterator[str]:
-    for key, value in content.items():
-        path = (*above, str(key))
-        nested = isinstance(value, Mapping) and value
-        text = f"{'  ' * len(path)}{key}: {'' if nested else _flow(value)}".rstrip()
-        comment = said.get(".".join(path))
-        yield text if comment is None else f"{text:<{BESIDE - 2}}  # {comment}"
-        if nested:
-            yield from _keys(value, said, path)
-
-
-def _flow(value: object) -> str:
-    if value == "???":
-        return "(required)"
-    text = yaml.safe_dump(value, default_flow_style=True, width=10**6, sort_keys=False)
-    return str(text).removesuffix("\n").removesuffix("\n...")
-
-
 def comments(text: str) -> Iterator[tuple[str, str]]:
     """Keys of a yaml file, with dots, and the comments that stand behind them."""
+    for line, key in _keyed(text):
+        comment = re.search(r":(?:|.*\s)#\s*(.+)$", line)
+        if comment is not None:
+            yield key, comment[1]
+
+
+def _keyed(text: str) -> Iterator[tuple[str, str]]:
+    """Lines of a yaml file that have a key, and the key with dots."""
     above: list[tuple[int, str]] = []
     for line in text.splitlines():
-        match = re.match(r"( *)([\w]+):(.*)$", line)
-        if match is None:
-            continue
-        above = [entry for entry in above if entry[0] < len(match[1])] + [(len(match[1]), match[2])]
-        comment = re.search(r"(?:^|\s)#\s*(.+)$", match[3])
-        if comment is not None:
-            yield ".".join(key for _, key in above), comment[1]
+        match = re.match(r"( *)(\w+):", line)
+        if match is not None:
+            above = [entry for entry in above if entry[0] < len(match[1])] + [(len(match[1]), match[2])]
+            yield line, ".".join(key for _, key in above)
 
 
 def heading(path: Path) -> str:

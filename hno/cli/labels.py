@@ -2,45 +2,42 @@
 
 from __future__ import annotations
 
+import functools
 import sys
-import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
 from hno.cli.arguments import Arguments
-from hno.cli.build import build_game
-from hno.cli.config import configured
-from hno.cli.logs import use_threads
-from hno.cli.schema import LabelSettings
-from hno.cli.starts import cache_folder
-from hno.data import labels as label_data
+from hno.cli.config import configured, read
+from hno.cli.logs import label_progress, use_threads
+from hno.cli.settings import LabelSettings
 from hno.data.certificates import GLOBAL_GAP, LOCAL_GAP, summary
-from hno.data.labels import Report, Request, label_set, labels_for
+from hno.data.labels import Request, default_cache, label_set, labels_for
 from hno.data.store import LabelFileError
-from hno.games import Game
+from hno.games import Game, make
 from hno.games.grid import parse_types
 from hno.types import Status
+
+COLUMNS = (
+    "theta", "starts", "converged", "inevitable collisions", "safe", "re-integration", "local gap", "global gap",
+)  # fmt: skip
 
 
 def run(given: Arguments) -> int:
     """`hno labels`; the exit code is 0 only if every set is complete."""
     use_threads(1)
+    settings = configured("labels", functools.partial(read, LabelSettings), given)
     try:
-        settings = configured("labels", LabelSettings, given)
         if settings is not None:
             generate(settings)
-    except BrokenProcessPool:
-        text = "A worker process was killed, mostly for lack of memory. Finished shards are kept: try fewer workers."
-        print(text, file=sys.stderr)
-        return 1
-    except (OSError, LookupError, ValueError, LabelFileError) as error:
-        print(error, file=sys.stderr)
+    except (BrokenProcessPool, LabelFileError) as error:
+        killed = "A worker process was killed, mostly for lack of memory. Finished shards are kept: try fewer workers."
+        print(killed if isinstance(error, BrokenProcessPool) else error, file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print("Stopped. Finished shards are kept: the same command goes on from here.", file=sys.stderr)
@@ -50,14 +47,13 @@ def run(given: Arguments) -> int:
 
 def generate(settings: LabelSettings) -> None:
     """Generate, and print a table and where the sets are."""
-    game, cache = build_game(settings.game), cache_folder(settings.cache)
+    game, cache = make(settings.game.name, **settings.game.constants), Path(settings.cache or default_cache())
     requests = [
-        Request(theta, settings.n, settings.seed, settings.split, float(settings.widen))
+        Request(theta, settings.n, settings.seed, settings.split, settings.widen)
         for theta in parse_types(game, settings.theta, key="theta")
     ]
-    console = Console()
-    with progress_report(console) as report:
-        found, seconds = labels_for(game, requests, cache, workers=settings.workers, report=report)
+    console, report = Console(), label_progress(functools.partial(print, flush=True))
+    found, seconds = labels_for(game, requests, cache, workers=settings.workers, report=report)
     rows = [summary(labels) for labels in found]
     console.print(_table(game, requests, rows))
     console.print(_total(rows), highlight=False)
@@ -68,28 +64,6 @@ def generate(settings: LabelSettings) -> None:
     console.print(f"{seconds:.0f} s. Label sets:", highlight=False)
     for request in requests:
         print(label_set(game, request, cache).folder)
-
-
-@contextmanager
-def progress_report(console: Console, every: float = 10.0) -> Iterator[Report]:
-    """A live bar on a terminal, elsewhere a line every so many seconds."""
-    columns = (BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
-    began = last = time.monotonic()
-    with Progress(*columns, TimeRemainingColumn(), console=console, disable=not console.is_terminal) as bar:
-        task = bar.add_task("solving", total=None)
-
-        def say(now: label_data.Progress) -> None:
-            nonlocal last
-            clock = time.monotonic()
-            rate = now.done / max(clock - began, 1e-9)
-            text = f"{now.converged} converged, {now.done - now.converged} failed, {rate:.1f}/s"
-            bar.update(task, completed=now.done, total=now.total, description=text)
-            if not console.is_terminal and (clock - last >= every or now.done == now.total):
-                last = clock
-                left = (now.total - now.done) / rate
-                print(f"{now.done} of {now.total}: {text}, {left:.0f} s left", flush=True)
-
-        yield say
 
 
 def _total(rows: Sequence[dict[str, Any]]) -> str:
@@ -106,17 +80,7 @@ def _total(rows: Sequence[dict[str, Any]]) -> str:
 
 def _table(game: Game, requests: Sequence[Request], rows: Sequence[dict[str, Any]]) -> Table:
     table = Table(title=f"{type(game).__name__}, split {requests[0].split}, seed {requests[0].seed}")
-    columns = (
-        "theta",
-        "starts",
-        "converged",
-        "inevitable collisions",
-        "safe",
-        "re-integration",
-        "local gap",
-        "global gap",
-    )
-    for name in columns:
+    for name in COLUMNS:
         table.add_column(name, justify="right")
     for request, row in zip(requests, rows, strict=True):
         worst = [row[f"largest_{name}"] for name in ("reintegration", "local_gap", "global_gap")]

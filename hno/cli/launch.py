@@ -5,123 +5,138 @@ from __future__ import annotations
 import logging
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
+import traceback
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any, NamedTuple
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
-from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from lightning.fabric.utilities.exceptions import MisconfigurationException
+from omegaconf import DictConfig
 
+import hno
 from hno.cli import pages
 from hno.cli.arguments import Arguments
-from hno.cli.config import compose, for_hydra, quoted, register_plugins, under_hydra
-from hno.cli.results import Results
-from hno.cli.schema import S, Settings
-from hno.cli.sweep import Job, counted, show_jobs
+from hno.cli.config import configured, for_hydra, quoted, register_plugins, sentence, under_hydra
+from hno.cli.logs import finish_wandb, send_lightning_to_hydra
+from hno.cli.results import Results, recorded
+from hno.cli.sections import show
+from hno.cli.sweep import Job, show_jobs
+from hno.evaluation.format import counted
+from hno.registry import UnknownNameError
 from hno.training.checkpoint import CheckpointError
 
 log = logging.getLogger(__name__)
 
-REFUSALS = (HydraException, OmegaConfBaseException, CheckpointError, ValueError, LookupError)
+REFUSALS = (HydraException, CheckpointError, ValueError, LookupError)
 """What a configuration raises that makes no run."""
 NAMED = ("game", "operator", "activation")
 """Groups that name a job in results.json."""
+QUIET = ("hydra/hydra_logging=disabled", "hydra/job_logging=disabled", "hydra.output_subdir=null")
 
 
-def run(name: str, check: Callable[[DictConfig], S], task: Callable[[S], bool], given: Arguments) -> int:
-    """Check configurations and run a task on each, in every job of a multirun.
+class Task(NamedTuple):
+    """What a command does in every job."""
 
-    A multirun ends with a table of its jobs, also when it is interrupted. The last line is the path of the page, which
-    failed runs have too; a configuration that is refused leaves no folder, in a multirun its reason alone.
+    name: str
+    """The root configuration."""
+    check: Callable[[DictConfig], Any]
+    """Judges a composed configuration before any work, and returns its settings."""
+    head: Callable[[Any], dict[str, Any]]
+    """What results.json says from the beginning, from the settings."""
+    work: Callable[[Any, Results], None]
+    """Does the job, from the settings."""
 
-    Args:
-        name: the root configuration.
-        check: judges a composed configuration before its work and returns its settings.
-        task: does one job; false if it failed (it has said why).
-        given: the command line.
+
+def run(task: Task, given: Arguments) -> int:
+    """Check configurations and do a task on each, in every job of a multirun.
+
+    The last line is the path of the page, which failed runs have too; a configuration that is refused leaves no folder,
+    in a multirun its reason alone.
 
     Returns:
         The exit code: 1 if a job failed.
     """
-    overrides = for_hydra(name, given)
-    register_plugins()
-    many, dry = "--multirun" in given.flags, "--dry-run" in given.flags
+    many = "--multirun" in given.flags
     try:
-        if not many:
-            config = compose(name, overrides)
-            settings = check(config)
-            if dry:
-                print(OmegaConf.to_yaml(OmegaConf.create(settings.model_dump())), end="")
-                return 0
-        elif dry:
-            return _dry_jobs(name, check, overrides)
-        return _run_jobs(name, check, task, [*given.hydra, *overrides])
-    except OSError as error:
-        return _refuse(f"The output folder cannot be written ({error}). Choose another with --to <folder>.")
+        if not many and configured(task.name, task.check, given) is None:
+            return 0  # a dry run
+        return _jobs(task, given, many, dry=many and "--dry-run" in given.flags)
     except REFUSALS as error:
-        return _refuse(str(error))
-
-
-def _refuse(message: str) -> int:
+        message = sentence(error)
+    except OSError as error:
+        message = f"The output folder cannot be written ({error}). Choose another with --to <folder>."
     print(message, file=sys.stderr)
     return 1
 
 
-def _run_jobs(name: str, check: Callable[[DictConfig], S], task: Callable[[S], bool], words: Sequence[str]) -> int:
-    outcomes: list[bool] = []
+def _jobs(task: Task, given: Arguments, many: bool, dry: bool) -> int:
+    """Let Hydra run every job. A sweep ends with a table, also when it is interrupted; a dry one prints its jobs."""
     jobs: list[Job] = []
-    folders: list[Path] = []
+    outcomes: list[bool] = []
 
     def job(config: DictConfig) -> None:
         current = Job.current()
-        jobs.extend([] if current is None else [current])
+        jobs.append(current)
+        if dry:
+            print(f"{current.number}: {' '.join(current.settings)}")
         try:
-            settings = check(config)
+            settings = task.check(config)
         except Exception as error:
-            outcomes.append(_refused(error))
-            return
-        folders.append(Path(HydraConfig.get().runtime.output_dir))
-        outcomes.append(task(settings))
+            print(f"   refused: {error}") if dry else _refuse(current, error)
+            outcomes.append(False)
+        else:
+            outcomes.append(dry or perform(task, settings, current.folder))
 
-    try:
-        under_hydra(name, job, words)
-    finally:
-        if jobs:
-            show_jobs(jobs)
-    for folder in folders if not jobs else ():
-        if (folder / "results.json").exists():
-            print(pages.write(folder))
+    words = [*(["--multirun"] if many else []), *for_hydra(task.name, given)]
+    register_plugins()
+    with tempfile.TemporaryDirectory() as nowhere:
+        try:
+            under_hydra(task.name, job, [*words, *QUIET, f"hydra.sweep.dir={quoted(nowhere)}"] if dry else words)
+        finally:
+            if many and jobs and not dry:
+                show_jobs(jobs)
+    if dry:
+        refused = outcomes.count(False)
+        print(counted(len(jobs), "job") + (f", {refused} refused" if refused else ""))
+    if not many:
+        print(pages.write(jobs[0].folder))
     return 0 if all(outcomes) else 1
 
 
-def _refused(error: Exception) -> bool:
+def _refuse(job: Job, error: Exception) -> None:
     """Leave the reason in the results of a job that is not run: it is no failure of the jobs after it."""
-    found, reason = HydraConfig.get(), str(error)
-    chosen = {group: found.runtime.choices.get(group) for group in NAMED}
-    Results(Path(found.runtime.output_dir) / "results.json", chosen).update(status="failed", reason=reason)
-    log.error("%s", reason, exc_info=None if isinstance(error, REFUSALS) else error)
-    return False
+    chosen = HydraConfig.get().runtime.choices
+    results = Results(job.folder / "results.json", {group: chosen.get(group) for group in NAMED})
+    results.update(status="failed", reason=str(error))
+    log.error("%s", error, exc_info=None if isinstance(error, REFUSALS) else error)
 
 
-def _dry_jobs(name: str, check: Callable[[DictConfig], Settings], overrides: Sequence[str]) -> int:
-    """Print the jobs of a multirun, and why some would be refused."""
-    outcomes: list[bool] = []
+def perform(task: Task, settings: Any, folder: Path) -> bool:
+    """Do one job; its folder gets results.json.
 
-    def job(config: DictConfig) -> None:
-        found = Job.current()
-        assert found is not None
-        reason = ""
-        try:
-            check(config)
-        except REFUSALS as error:
-            reason = f"\n   refused: {error}"
-        outcomes.append(not reason)
-        print(f"{found.number}: {' '.join(found.settings)}{reason}")
+    Returns:
+        Whether it succeeded. A failure has been logged and is in the results.
+    """
+    send_lightning_to_hydra()
+    results = Results(folder / "results.json", task.head(settings))
+    try:
+        with recorded(results):
+            task.work(settings, results)
+    except Exception as error:
+        _log(error)
+        return False
+    finally:
+        finish_wandb(results.content)
+    show(results.content, folder)
+    return True
 
-    quiet = ["hydra/hydra_logging=disabled", "hydra/job_logging=disabled", "hydra.output_subdir=null"]
-    with tempfile.TemporaryDirectory() as folder:
-        under_hydra(name, job, ["--multirun", *overrides, *quiet, f"hydra.sweep.dir={quoted(folder)}"])
-    refused = outcomes.count(False)
-    print(counted(len(outcomes)) + (f", {refused} refused" if refused else ""))
-    return 1 if refused else 0
+
+def _log(error: Exception) -> None:
+    """Log what went wrong: one message for errors that were raised on purpose, a traceback for surprises."""
+    frames = traceback.extract_tb(error.__traceback__)
+    ours = bool(frames) and Path(frames[-1].filename).is_relative_to(Path(hno.__file__).parent)
+    meant = ours and isinstance(error, (ValueError, RuntimeError, UnknownNameError))
+    expected = meant or isinstance(error, (OSError, MisconfigurationException))
+    log.error("%s", error, exc_info=None if expected else error)

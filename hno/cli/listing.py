@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Iterator
-from pathlib import Path
 
 from hno.cli.arguments import Arguments, UsageError
 from hno.cli.config import choices, config_dir
 from hno.cli.help import heading
-from hno.cli.kinds import REGISTRIES
+from hno.cli.schema import REGISTRIES
 from hno.registry import Description, plural, unknown_name
 
 KINDS = ("game", "method", "operator", "network", "activation", "loss", "source", "optimizer")
@@ -32,8 +30,7 @@ def run(given: Arguments) -> int:
     failed = dict[str, str]()
     for kind in dict.fromkeys(names[word] for word in given.words or KINDS):
         print(f"{plural(kind)} ({ABOUT.get(kind, f'{kind}=NAME')})")
-        rows = list(_methods() if kind == "method" else _registered(kind, failed))
-        for row in rows:
+        for row in _methods() if kind == "method" else _registered(kind, failed):
             print(f"  {row.name:<14}{row.summary}  [{row.origin}]")
         print()
     for what, why in failed.items():
@@ -41,20 +38,16 @@ def run(given: Arguments) -> int:
     return 1 if failed else 0
 
 
-def _registered(kind: str, failed: dict[str, str]) -> Iterator[Description]:
+def _registered(kind: str, failed: dict[str, str]) -> list[Description]:
     with warnings.catch_warnings(action="ignore"):  # what cannot be loaded is said at the end
         registry = REGISTRIES[kind]()
         found = [registry.describe(name) for name in registry.names()]
     failed.update(registry.broken)
-    yield from found
+    return found
 
 
-def _methods() -> Iterator[Description]:
-    for name, path in choices("operator").items():
-        if path is not None:
-            yield Description(name, heading(path), _owner(path))
-
-
-def _owner(path: Path) -> str:
-    folder = path.parent.parent
-    return "hno" if folder == config_dir() else folder.parent.name
+def _methods() -> list[Description]:
+    files = [(name, path) for name, path in choices("operator").items() if path is not None]
+    places = [path.parent.parent for _, path in files]  # conf of ours, or of a package
+    origins = ["hno" if place == config_dir() else place.parent.name for place in places]
+    return [Description(name, heading(path), origin) for (name, path), origin in zip(files, origins, strict=True)]

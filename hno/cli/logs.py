@@ -6,10 +6,10 @@ import logging
 import math
 import os
 import socket
-import sys
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlparse
@@ -17,27 +17,45 @@ from urllib.parse import urlparse
 import lightning as L
 import torch
 import wandb
-from lightning.pytorch.callbacks import ProgressBar, RichProgressBar
+from lightning.pytorch.callbacks import RichProgressBar
 from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger, WandbLogger
 
-from hno.cli.schema import TrainSettings
+from hno.cli.settings import TrainSettings
 from hno.data.labels import Progress, Report
 
 log = logging.getLogger(__name__)
+EXPECTED = (
+    ".*exists and is not empty",  # results.json is there first, on purpose
+    ".*isinstance.treespec, LeafSpec.",  # Lightning's own, from torch 2.13 on
+    ".*does not have many workers",  # batches are made in memory
+)
+"""Warnings of Lightning that mean nothing here."""
 
 
 def send_lightning_to_hydra() -> None:
     """Let Lightning's messages and Python's warnings reach Hydra's handlers, console and file."""
     logging.captureWarnings(True)
     warnings.formatwarning = lambda message, category, *_, **__: f"{category.__name__}: {message}"
-    warnings.filterwarnings("ignore", message=".*exists and is not empty")  # results.json is there first, on purpose
-    warnings.filterwarnings("ignore", message=".*isinstance.treespec, LeafSpec.")  # Lightning's own, from torch 2.13 on
-    warnings.filterwarnings("ignore", message=".*does not have many workers")  # batches are made in memory
+    warnings.filterwarnings("ignore", message="|".join(EXPECTED))
     logging.getLogger("lightning.pytorch.utilities.rank_zero").addFilter(lambda line: "Tip:" not in line.getMessage())
     for name in ("lightning", "lightning.pytorch", "lightning.fabric"):
         logger = logging.getLogger(name)
         logger.handlers.clear()
         logger.propagate = True
+
+
+@contextmanager
+def quiet_lightning() -> Iterator[None]:
+    """Lightning speaks of what goes wrong only, where a program trains."""
+    logger = logging.getLogger("lightning.pytorch")
+    before = logger.level
+    logger.setLevel(logging.WARNING)
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message="|".join(EXPECTED))
+            yield
+    finally:
+        logger.setLevel(before)
 
 
 class LoggerMissingError(RuntimeError):
@@ -57,42 +75,24 @@ def loggers(settings: TrainSettings, folder: Path) -> list[Logger]:
         LoggerMissingError: the package of a logger is not installed.
         ValueError: W&B cannot run as asked for.
     """
-    made = [LOGGERS[name](settings, folder) for name in dict.fromkeys(settings.logger.names)]
-    return [logger for logger in made if logger is not None]
-
-
-def _csv(settings: TrainSettings, folder: Path) -> Logger:
-    return CSVLogger(folder, name="", version="csv")
-
-
-def _tensorboard(settings: TrainSettings, folder: Path) -> Logger:
-    try:
-        return TensorBoardLogger(folder, name="", version="tensorboard", default_hp_metric=False)
-    except ModuleNotFoundError as error:
-        message = "TensorBoard is not installed: `pip install tensorboard`, or choose logger=csv."
-        raise LoggerMissingError(message) from error
-
-
-def _wandb(settings: TrainSettings, folder: Path) -> Logger | None:
-    mode = wandb_mode(settings.logger.mode)
-    if mode == "disabled":
-        return None
-    return WandbLogger(
-        project=settings.logger.project,
-        group=folder.parent.name,
-        name=folder.name,
-        save_dir=folder,
-        mode=mode,
-        config=settings.model_dump(),
-    )
-
-
-LOGGERS: Mapping[str, Callable[[TrainSettings, Path], Logger | None]] = {
-    "csv": _csv,
-    "tensorboard": _tensorboard,
-    "wandb": _wandb,
-}
-"""What `logger.names` may hold."""
+    made: list[Logger] = []
+    for name in dict.fromkeys(settings.logger.names):
+        if name == "csv":
+            made.append(CSVLogger(folder, name="", version="csv"))
+        elif name == "tensorboard":
+            try:
+                made.append(TensorBoardLogger(folder, name="", version="tensorboard", default_hp_metric=False))
+            except ModuleNotFoundError as error:
+                message = "TensorBoard is not installed: `pip install tensorboard`, or choose logger=csv."
+                raise LoggerMissingError(message) from error
+        elif (mode := wandb_mode(settings.logger.mode)) != "disabled":
+            made.append(
+                WandbLogger(
+                    name=folder.name, save_dir=folder, mode=mode, project=settings.logger.project,
+                    group=folder.parent.name, config=settings.model_dump(),
+                )
+            )  # fmt: skip
+    return made
 
 
 def finish_wandb(results: Mapping[str, Any]) -> None:
@@ -113,43 +113,43 @@ def wandb_mode(choice: str) -> str:
         ValueError: "online" without a key.
     """
     choice = os.environ.get("WANDB_MODE", choice) if choice == "auto" else choice
-    has_key = bool(os.environ.get("WANDB_API_KEY") or wandb.api.api_key)
+    has_key, server = bool(os.environ.get("WANDB_API_KEY") or wandb.api.api_key), wandb.Settings().base_url
     if choice == "online" and not has_key:
         raise ValueError("W&B has no API key to run online: `wandb login`, set WANDB_API_KEY, or use logger.mode=auto.")
     if choice != "auto":
         return choice
-    settings = wandb.Settings()
     if not has_key:
         log.info("W&B runs offline: no API key. `wandb login` or WANDB_API_KEY makes it online.")
-        return "offline"
-    if not _reachable(settings.base_url):
-        log.info("W&B runs offline: %s cannot be reached. `wandb sync` uploads the run later.", settings.base_url)
-        return "offline"
-    return "online"
+    elif not _reachable(server):
+        log.info("W&B runs offline: %s cannot be reached. `wandb sync` uploads the run later.", server)
+    else:
+        return "online"
+    return "offline"
 
 
-def _reachable(url: str, seconds: float = 3.0) -> bool:
+def _reachable(url: str) -> bool:
     parts = urlparse(url)
     try:
-        with socket.create_connection((parts.hostname or "", parts.port or 443), timeout=seconds):
+        with socket.create_connection((parts.hostname or "", parts.port or 443), timeout=3.0):
             return True
     except OSError:
         return False
 
 
-def label_progress(every: float = 10.0) -> Report:
-    """A function that logs how many labels are solved, at most one line every so many seconds."""
+def label_progress(say: Callable[[str], None] = log.info, every: float = 10.0) -> Report:
+    """A function that says how many labels are solved, at most one line every so many seconds."""
     began = last = time.monotonic()
 
-    def say(progress: Progress) -> None:
+    def report(progress: Progress) -> None:
         nonlocal last
-        now = time.monotonic()
-        if now - last >= every or progress.done == progress.total:
+        now, left = time.monotonic(), progress.total - progress.done
+        if now - last >= every or not left:
             last = now
-            failed = f", {progress.done - progress.converged} failed" if progress.converged < progress.done else ""
-            log.info("labels: %d of %d in %.0f s%s", progress.done, progress.total, now - began, failed)
+            counts = f"{progress.converged} converged, {progress.done - progress.converged} failed"
+            seconds = (now - began) / max(progress.done, 1) * left
+            say(f"labels: {progress.done} of {progress.total}: {counts}, {seconds:.0f} s left")
 
-    return say
+    return report
 
 
 class StepBar(RichProgressBar):
@@ -163,16 +163,9 @@ class StepBar(RichProgressBar):
     def _get_train_description(self, current_epoch: int) -> str:
         return "training"
 
-    def get_metrics(
-        self, trainer: L.Trainer, pl_module: L.LightningModule
-    ) -> dict[str, int | str | float | dict[str, float]]:
+    def get_metrics(self, *run: Any) -> dict[str, Any]:
         """Losses, without the logger's version."""
-        return {name: value for name, value in super().get_metrics(trainer, pl_module).items() if name != "v_num"}
-
-
-def progress_bar() -> ProgressBar | None:
-    """A live bar on a terminal, nothing elsewhere."""
-    return StepBar() if sys.stdout.isatty() else None
+        return {name: value for name, value in super().get_metrics(*run).items() if name != "v_num"}
 
 
 class StepLines(L.Callback):
@@ -185,9 +178,7 @@ class StepLines(L.Callback):
     def __init__(self, every: int) -> None:
         self.every = every
 
-    def on_train_batch_end(
-        self, trainer: L.Trainer, pl_module: L.LightningModule, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
+    def on_train_batch_end(self, trainer: L.Trainer, *others: Any) -> None:
         """Print the losses."""
         if trainer.global_step % self.every == 0:
             found = [(name, float(value)) for name, value in sorted(trainer.callback_metrics.items())]

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import hno
-from hno.cli.arguments import Arguments, UsageError, parse
+from hno.cli.arguments import FLAGS, Arguments, UsageError, parse
 from hno.registry import unknown_name
 
 
@@ -32,19 +32,8 @@ class Command(NamedTuple):
     """Flags besides --help and --version."""
 
 
-JOBS = (
-    "--dry-run", "--to", "--multirun", "--config-dir", "--cfg", "--package", "--info", "--resolve", "--hydra-help",
-    "--shell-completion",
-)  # fmt: skip
+JOBS = tuple(name for name in FLAGS if name not in ("--help", "--version"))
 FOLDERS = ("hydra.run.dir", "hydra.sweep.dir")
-FLAGS = {
-    "--dry-run": "print the configuration (with -m: the jobs) after it has been checked, and end",
-    "--to": "PATH: where results go",
-    "--multirun": "(or -m) run every combination of values that are separated by commas; anywhere on the line",
-    "--config-dir": "FOLDER: choices of your own, such as FOLDER/experiment/mine.yaml",
-    "--help": "this text",
-    "--version": "hno's version",
-}
 COMMANDS = {
     "train": Command(
         "hno.cli.train:run", "[group=choice ...] [key=value ...] [-m]",
@@ -104,9 +93,9 @@ def main(given: Sequence[str] | None = None, prog: str | None = None) -> int:
     except BrokenPipeError:  # whoever read what is printed has read enough, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
-    except UsageError as error:
+    except (LookupError, OSError, ValueError) as error:
         print(error, file=sys.stderr)
-        return 2
+        return 2 if isinstance(error, UsageError) else 1
     except KeyboardInterrupt:
         print("Interrupted.", file=sys.stderr)
         return 130
@@ -122,10 +111,11 @@ def _run(command: Command, given: Arguments, prog: str) -> int:
     if "--help" in given.flags:
         print(_help(command, given, prog), flush=True)
         return 0
-    if command.config is not None and {"--shell-completion", "--hydra-help"} & given.flags.keys():
-        from hno.cli.config import hydras_own
+    if command.config is not None and "--shell-completion" in given.flags:
+        from hno.cli.config import complete
 
-        return hydras_own(command.config, given)
+        complete(command.config, given.overrides)
+        return 0
     return int(pkgutil.resolve_name(command.run)(_configured(command, given, prog)))
 
 
@@ -149,9 +139,9 @@ def _overview() -> str:
 
 
 def _help(command: Command, given: Arguments, prog: str) -> str:
-    shown = [flag for flag in FLAGS if flag in (*command.flags, "--help", "--version")]
-    flags = [f"  {flag:<14}{FLAGS[flag]}" for flag in shown]
-    parts = [f"Usage: {prog} {command.usage}", command.about, "\n".join(["Flags", *flags])]
+    flags = (*command.flags, "--help", "--version")
+    shown = [f"  {name:<20}{about}" for name, about in FLAGS.items() if name in flags]
+    parts = [f"Usage: {prog} {command.usage}", command.about, "\n".join(["Flags", *shown])]
     if command.config is not None:
         from hno.cli.help import configuration_help
 

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from lightning.pytorch.loggers import Logger, TensorBoardLogger, WandbLogger
 
 from hno.evaluation.format import number
@@ -30,10 +31,12 @@ def publish(loggers: Sequence[Logger], results: Mapping[str, Any], folder: Path,
     pictures = draw(results, folder, {type(logger) for logger in loggers})
     for logger in loggers:
         try:
+            logger.log_metrics(numbers(results), step)
             if isinstance(logger, TensorBoardLogger):
-                _send_to_tensorboard(logger, results, pictures, step)
-            else:
-                logger.log_metrics(numbers(results), step)
+                for name, path in pictures.items():
+                    from PIL.Image import open as read  # pictures are drawn where it is installed only
+
+                    logger.experiment.add_image(name, np.asarray(read(path)), step, dataformats="HWC")
             if isinstance(logger, WandbLogger):
                 _send_to_wandb(logger, results["table"], pictures, step)
             logger.finalize("success")  # the end of the training finalized it before these numbers came
@@ -68,32 +71,39 @@ def draw(results: Mapping[str, Any], folder: Path, kinds: Collection[type[Logger
     Returns:
         Names and files of the pictures.
     """
-    title = " / ".join(str(results.get(name, "n/a")) for name in ("game", "operator", "activation"))
+    title = title_of(results)
     made = {name: folder / f"{name}.png" for name in ("rollout", "worst_episode", "collision_map")}
     with _harmless():
-        from hno.report import pictures
-        from hno.report.episode import episode
+        from hno.report.pictures import collision_map
 
-        worst = worst_episode(results, folder) if WandbLogger in kinds else None
-        if worst is not None:
+        if WandbLogger in kinds and (worst := worst_episode(results, folder)):
             smallest = f"{number(worst['clearance'])} {results.get('constraint_unit', 'm')}".strip()
             heading = f"{title}\nsmallest clearance, {smallest} at ({name_of(worst['theta'])})"
-            pictures.rollout_picture(episode(worst), made["worst_episode"], heading)
-        if not {WandbLogger, TensorBoardLogger}.isdisjoint(kinds):
-            pictures.collision_map(results["table"], made["collision_map"], title)
+            _draw_episode(worst, made["worst_episode"], heading)
+        if {WandbLogger, TensorBoardLogger} & set(kinds):
+            collision_map(results["table"], made["collision_map"], title)
     return {name: path for name, path in made.items() if path.exists()}
 
 
 def draw_typical(episodes: Sequence[Mapping[str, Any]], path: Path, title: str) -> None:
     """Draw the first typical episode of episodes.json, if there is one; say what cannot be drawn."""
     with _harmless():
-        from hno.report.episode import episode
-        from hno.report.pictures import rollout_picture
-
         typical = next((entry for entry in episodes if entry["kind"] == "typical"), None)
         if typical is None:
             raise ValueError("no start has a safe equilibrium")
-        rollout_picture(episode(typical), path, title)
+        _draw_episode(typical, path, title)
+
+
+def _draw_episode(content: Mapping[str, Any], path: Path, title: str) -> None:
+    from hno.report.episode import episode
+    from hno.report.pictures import rollout_picture
+
+    rollout_picture(episode(content), path, title)
+
+
+def title_of(results: Mapping[str, Any]) -> str:
+    """What was evaluated, for pictures."""
+    return " / ".join(str(results.get(name, "n/a")) for name in ("game", "operator", "activation"))
 
 
 @contextmanager
@@ -118,20 +128,8 @@ def worst_episode(results: Mapping[str, Any], folder: Path) -> dict[str, Any] | 
 def _send_to_wandb(logger: WandbLogger, table: Sequence[Any], pictures: Mapping[str, Path], step: int) -> None:
     whole = pooled(table)
     nobody = "n/a" if whole.rate is None else "none"
-    logger.experiment.summary["test/worst_theta"] = name_of(whole.worst_theta) if whole.worst_theta else nobody
+    logger.experiment.summary["test/worst_theta"] = name_of(whole.worst_theta or ()) or nobody
     for name, path in pictures.items():
         logger.log_image(name, [str(path)], step)
     columns = list(table[0]) if table else []
     logger.log_table("types", columns, [[str(row[name]) for name in columns] for row in table], step=step)
-
-
-def _send_to_tensorboard(
-    logger: TensorBoardLogger, results: Mapping[str, Any], pictures: Mapping[str, Path], step: int
-) -> None:
-    head = {name: str(results.get(name)) for name in ("game", "operator", "activation", "seed", "config_hash")}
-    logger.log_hyperparams(head, numbers(results), step)
-    for name, path in pictures.items():
-        from numpy import asarray
-        from PIL.Image import open as read
-
-        logger.experiment.add_image(name, asarray(read(path)), step, dataformats="HWC")

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 import shlex
-import sys
 import time
 from pathlib import Path
 
 from hno.cli.arguments import Arguments
-from hno.cli.config import configured
-from hno.cli.schema import ReportSettings
+from hno.cli.config import configured, read
+from hno.cli.settings import ReportSettings
 
 PAGE = "report.html"
 
@@ -39,28 +39,22 @@ def _needs(error: ModuleNotFoundError) -> str:
 
 def run(given: Arguments) -> int:
     """`hno report`."""
+    settings = configured("report", functools.partial(read, ReportSettings), given)
     try:
-        settings = configured("report", ReportSettings, given)
         if settings is not None:
-            _report(settings)
+            _report(settings, Path(settings.folder))
     except ModuleNotFoundError as error:
-        print(f"A report {_needs(error)}", file=sys.stderr)
-        return 1
-    except (ValueError, OSError) as error:  # no runs, or settings that make no sense
-        print(error, file=sys.stderr)
-        return 1
+        raise OSError(f"A report {_needs(error)}") from error
     return 0
 
 
-def _report(settings: ReportSettings) -> None:
+def _report(settings: ReportSettings, folder: Path) -> None:
     from hno.report.runs import load
 
-    folder = Path(settings.folder)
     if settings.figures:
         from hno.report.figures import write_figures
 
-        for path in write_figures(load(folder), Path(settings.to or folder / "figures")):
-            print(path)
+        print(*write_figures(load(folder), Path(settings.to or folder / "figures")), sep="\n")
         return
     from hno.report.page import write_page
 

@@ -6,12 +6,12 @@ import hashlib
 import json
 import math
 import platform
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
 from pydantic import BaseModel
 
 import hno
@@ -20,24 +20,18 @@ from hno.data.store import replace_whole
 PACKAGES = ("torch", "lightning", "torchmetrics", "hydra-core", "omegaconf", "wandb", "scipy", "safetensors")
 
 
-def plain(config: DictConfig | BaseModel) -> dict[str, Any]:
-    """A configuration as plain containers."""
-    content = config.model_dump() if isinstance(config, BaseModel) else OmegaConf.to_container(config, resolve=True)
-    assert isinstance(content, dict)
-    return {str(key): value for key, value in content.items()}
+NUMBERS_DO_NOT_DEPEND_ON: dict[str, Any] = {
+    **dict.fromkeys(("logger", "resume", "checkpoint", "cache", "workers", "threads"), True),
+    "data": {"cache", "workers"},
+    "trainer": {"print_every", "threads"},
+}
+"""Folders, logging and the number of workers."""
 
 
-def config_hash(config: DictConfig | BaseModel) -> str:
-    """Hash of what determines a run's numbers; folders, logging and the number of workers do not."""
-    content = plain(config)
-    for key in ("logger", "resume", "checkpoint"):
-        content.pop(key, None)
-    for key in ("cache", "workers", "threads"):
-        content.pop(key, None)
-    for group, key in (("data", "cache"), ("data", "workers"), ("trainer", "print_every"), ("trainer", "threads")):
-        content.get(group, {}).pop(key, None)
-    text = json.dumps(content, sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
+def config_hash(settings: BaseModel) -> str:
+    """Hash of what determines a run's numbers."""
+    content = settings.model_dump(exclude=NUMBERS_DO_NOT_DEPEND_ON)
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def versions() -> dict[str, str]:
@@ -89,3 +83,15 @@ class Results:
     def write(self) -> None:
         """Write the file whole."""
         write_json(self.path, self.content, indent=2)
+
+
+@contextmanager
+def recorded(results: Results) -> Iterator[None]:
+    """Work whose end is in the results: that it is finished, or why it failed."""
+    try:
+        yield
+    except BaseException as error:
+        interrupted = isinstance(error, (KeyboardInterrupt, SystemExit))  # Lightning turns the one into the other
+        results.update(status="failed", reason="interrupted" if interrupted else f"{type(error).__name__}: {error}")
+        raise
+    results.update(status="finished")

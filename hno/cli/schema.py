@@ -1,33 +1,18 @@
-"""What configurations may hold: one schema for every command."""
+"""The schema of configurations: entries of given types, and registered parts with the options of their constructors."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
-from typing import Annotated, Any, TypeVar
+import inspect
+import pkgutil
+import re
+from collections.abc import Callable, Collection, Mapping
+from functools import partial
+from typing import Annotated, Any, TypeVar, get_args
 
-from pydantic import BaseModel, ConfigDict, PlainValidator, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, create_model
+from pydantic_core import PydanticCustomError
 
-from hno.cli import parts
-from hno.cli.entries import (
-    Amount,
-    Count,
-    Device,
-    Flag,
-    Paths,
-    Positive,
-    Seed,
-    Share,
-    Size,
-    Text,
-    Texts,
-    Types,
-    must,
-    number,
-    one_of,
-)  # fmt: skip
-from hno.registry import unknown_name
-
-LOGGERS = ("csv", "tensorboard", "wandb")
+from hno.registry import Registry, options_of, unknown_name
 
 
 class SettingsError(ValueError):
@@ -35,168 +20,9 @@ class SettingsError(ValueError):
 
 
 class Settings(BaseModel):
-    """Entries of a configuration; others are refused."""
+    """Entries of a configuration, each of the type that it says; others are refused."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class GameSettings(Settings):
-    """Which game, and constants that differ from its defaults."""
-
-    name: Text
-    constants: Annotated[dict[str, Any], PlainValidator(parts.mapping)]
-
-
-class BatchSizes(Settings):
-    """Rows per step of each stream; null for every labelled row."""
-
-    bvp: Size | None
-    interior: Size | None
-    terminal: Size | None
-
-
-class DataSettings(Settings):
-    """Labels and the curriculum."""
-
-    types: Types
-    trajectories: Size
-    validation: Size
-    batch_sizes: BatchSizes
-    pretrain: Share
-    widening: Share
-    finish: Share
-    interior_types: Annotated[str, one_of("labelled", "box")]
-    cache: Text | None
-    files: Texts
-    workers: Size | None
-
-
-class LossSettings(Settings):
-    """A method: its terms and weights."""
-
-    terms: Annotated[dict[str, dict[str, Any]], PlainValidator(parts.terms)]
-    weights: Annotated[dict[str, float], PlainValidator(parts.weights)]
-    norm: Annotated[str, one_of("huber", "l1", "l2")]
-    scaled: Flag
-    balance: Flag
-    hardest: Annotated[float, must("a share in (0, 1]", lambda value: number(value) and 0 < value <= 1)]
-
-
-class TrainerSettings(Settings):
-    """How long and on what."""
-
-    max_steps: Size
-    accelerator: Text
-    devices: Device
-    precision: Device
-    compile: Flag
-    gradient_clip_val: Positive | None
-    polish: Count
-    validate_every: Size
-    print_every: Size
-    threads: Size | None
-
-
-class LoggerSettings(Settings):
-    """Where metrics go."""
-
-    names: Annotated[
-        list[str],
-        must(
-            f"a list of {', '.join(LOGGERS)}",
-            lambda value: isinstance(value, list) and set(map(str, value)) <= set(LOGGERS),
-        ),
-    ]
-    project: Text
-    mode: Annotated[str, one_of("auto", "disabled", "offline", "online")]
-
-
-class Episodes(Settings):
-    """Under which conditions a policy is played."""
-
-    starts: Size
-    seed: Seed
-    clearance: Amount
-    dt: Positive
-    safe: Flag
-    widen: Positive
-    noise: Amount
-    delay: Count
-    ntk: Flag
-    ntk_rows: Size
-
-
-class EvaluationSettings(Episodes):
-    """The evaluation at the end of a training."""
-
-    types: Types
-
-
-class ValidationSettings(Settings):
-    """Closed-loop validation while an operator trains."""
-
-    types: Types
-    starts: Size
-    stop_when_safe: Flag
-    seed: Seed
-
-
-class TrainSettings(Settings):
-    """`hno train`."""
-
-    game: GameSettings
-    operator: Annotated[dict[str, Any], PlainValidator(parts.operator)]
-    network: Annotated[dict[str, Any], parts.part("network")]
-    activation: Annotated[dict[str, Any], parts.part("activation")]
-    data: DataSettings
-    sampler: Annotated[dict[str, dict[str, Any]], PlainValidator(parts.sampler)]
-    loss: LossSettings
-    optimizer: Annotated[dict[str, Any], PlainValidator(parts.optimizer)]
-    trainer: TrainerSettings
-    logger: LoggerSettings
-    evaluation: EvaluationSettings
-    validation: ValidationSettings
-    seed: Seed
-    resume: Text | None
-
-
-class EvaluateSettings(Episodes):
-    """`hno evaluate`."""
-
-    checkpoint: Paths
-    expected_game: Text | None
-    theta: Types
-    unseen: Types
-    residuals: Flag
-    robustness: Flag
-    conditions: Annotated[dict[str, Any], PlainValidator(parts.mapping)]
-    online: Count
-    online_interval: Size
-    cache: Text | None
-    workers: Size | None
-    threads: Size | None
-
-
-class LabelSettings(Settings):
-    """`hno labels`."""
-
-    game: GameSettings
-    theta: Types
-    n: Size
-    seed: Seed
-    split: Annotated[str, one_of("train", "test")]
-    widen: Positive
-    workers: Size | None
-    cache: Text | None
-
-
-class ReportSettings(Settings):
-    """`hno report`."""
-
-    folder: Text
-    to: Text | None
-    figures: Flag
-    watch: Annotated[float, must("a number of seconds of at least 1", lambda v: number(v) and v >= 1)] | None
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False, protected_namespaces=())
 
 
 S = TypeVar("S", bound=Settings)
@@ -221,18 +47,115 @@ def validated(model: type[S], content: Mapping[str, Any], given: Collection[str]
 
 def _sentence(model: type[Settings], found: Any) -> str:
     names = [str(part) for part in found["loc"]]
-    key = ".".join(names)
+    key, cause = ".".join(names), found.get("ctx", {}).get("error")
+    if isinstance(cause, SettingsError):  # of the options of a registered part
+        return "\n".join(f"{key}.{line}" for line in str(cause).splitlines())
     if found["type"] == "extra_forbidden":
-        return f"{key} does not exist. {unknown_name('configuration key', names[-1], _known(model, names[:-1]))}"
+        for name in names[:-1]:
+            nested = model.model_fields[name].annotation
+            model = (get_args(nested) or (nested,))[0]  # without "| None"
+        return f"{key} does not exist. {unknown_name('configuration key', names[-1], sorted(model.model_fields))}"
     if found["type"] == "missing":
         return f"{key} is missing: give it as {key}=<value>; --help says more."
-    if "error" in found.get("ctx", {}):
-        return key + str(found["ctx"]["error"])
-    return f"{key}: {found['msg']}; got {found['input']!r}."
+    expected = re.sub(r"^\w+ should", "must", found["msg"].partition(" or instance of ")[0])
+    return f"{key}: {cause}" if cause else f"{key} {expected}; got {found['input']!r}."
 
 
-def _known(model: type[Settings], above: list[str]) -> list[str]:
-    """The keys of a nested model."""
-    for name in above:
-        model = model.model_fields[name].annotation  # type: ignore[assignment]  # of nested settings
-    return sorted(model.model_fields)
+def _loose(value: Any) -> Any:
+    if isinstance(value, bool) or not isinstance(value, (int, float, str, list)):
+        raise PydanticCustomError("loose", "Input should be a number, text or a list")
+    return value
+
+
+Size = Annotated[int, Field(ge=1)]
+Count = Annotated[int, Field(ge=0)]
+Seed = Annotated[int, Field(ge=0, le=2**32 - 1)]
+Positive = Annotated[float, Field(gt=0)]
+Amount = Annotated[float, Field(ge=0)]
+Share = Annotated[float, Field(ge=0, le=1)]
+Text = Annotated[str, Field(min_length=1)]
+Loose = Annotated[Any, AfterValidator(_loose)]
+"""What Lightning judges, or `hno.games.grid.parse_types`."""
+REGISTRIES: Mapping[str, Callable[[], Registry[Any]]] = {
+    kind: partial(pkgutil.resolve_name, place)
+    for kind, place in {
+        "game": "hno.games:games",
+        "operator": "hno.operators:operators",
+        "network": "hno.operators:networks",
+        "activation": "hno.operators:activations",
+        "loss": "hno.losses:losses",
+        "source": "hno.data.sources:sources",
+        "optimizer": "hno.training.optimizers:optimizers",
+    }.items()
+}
+"""The registry of every kind, as a function that imports it."""
+GIVEN = {
+    "operator": ("game", "network"),
+    "network": ("inputs", "activation"),
+    "optimizer": ("params", "parameters", "lr"),
+}
+"""Arguments of constructors that the package passes: they are no options."""
+SHARED = ("exact_terminal", "members")
+"""Options of an operator that files of games and methods set."""
+SCHEDULE: Mapping[str, Any] = {"lr": (Positive, ...), "schedule": (str, ...), "final_lr": (Positive, ...)}
+"""Entries of an optimiser that belong to the schedule of its rate."""
+
+
+def _schema(kind: str, name: object, also: Mapping[str, Any]) -> type[Settings]:
+    """The schema of a registered name: each option has the type of its default."""
+    try:
+        factory = REGISTRIES[kind]().get(str(name))
+    except LookupError as error:
+        raise ValueError(str(error)) from error
+    annotations = {key: parameter.annotation for key, parameter in inspect.signature(factory).parameters.items()}
+    fields: dict[str, Any] = {}
+    for key, default in options_of(factory, skip=GIVEN.get(kind, ())).items():
+        whole = type(default) is int and annotations[key] not in (float, "float")  # torch writes 0 for 0.0
+        known = int if whole else {bool: bool, int: float, float: float, str: str}.get(type(default), Any)
+        fields[key] = (known, ... if default is inspect.Parameter.empty else default)
+    return create_model(str(name), __base__=Settings, **fields, **also)
+
+
+def _part(kind: str, also: Mapping[str, Any] = {}) -> AfterValidator:  # it is read only
+    """A registered name with some of its options."""
+
+    def check(content: dict[str, Any]) -> dict[str, Any]:
+        schema = _schema(kind, content.get("name"), {"name": (str, ...), **also})
+        return validated(schema, content).model_dump(exclude_unset=True)
+
+    return AfterValidator(check)
+
+
+def _several(kind: str, also: Mapping[str, Any] = {}) -> AfterValidator:  # it is read only
+    """Options by registered name, all of them; null removes one."""
+
+    def check(content: dict[str, Any]) -> dict[str, dict[str, Any]]:
+        schemas: dict[str, Any] = {
+            name: (_schema(kind, name, also) | None, None) for name in REGISTRIES[kind]().names()
+        }
+        found = validated(create_model(kind, __base__=Settings, **schemas), content).model_dump()
+        return {name: found[name] for name in content if found[name] is not None}
+
+    return AfterValidator(check)
+
+
+def _operator(content: dict[str, Any], info: ValidationInfo) -> dict[str, Any]:
+    """A method's name, its registered function and all of that function's options.
+
+    Files of games and methods set `SHARED` options; a function that does not know them is not given them.
+    """
+    schema = _schema("operator", content.get("function"), {"name": (str, ...), "function": (str, ...)})
+    given = {key for key in SHARED if f"operator.{key}" in (info.context or {}).get("given", ())}
+    dropped = set(SHARED) - schema.model_fields.keys() - given
+    return validated(schema, {k: v for k, v in content.items() if k not in dropped}).model_dump()
+
+
+Operator = Annotated[dict[str, Any], AfterValidator(_operator)]
+Network = Annotated[dict[str, Any], _part("network")]
+Activation = Annotated[dict[str, Any], _part("activation")]
+Optimizer = Annotated[dict[str, Any], _part("optimizer", SCHEDULE)]
+Sampler = Annotated[dict[str, Any], _several("source", {"share": (Amount, ...)})]
+Terms = Annotated[dict[str, Any], _several("loss")]
+Weights = Annotated[
+    dict[str, Amount | None], AfterValidator(lambda found: {k: v for k, v in found.items() if v is not None})
+]

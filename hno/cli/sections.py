@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 from rich.table import Table
 
 from hno.cli.results import Results
+from hno.evaluation.format import short_names
 from hno.evaluation.sections import Evaluation, ModelSection, sections
+
+WIDTH = 140
+"""Columns of text where there is no terminal to ask."""
 
 
 def chosen_sections(options: Mapping[str, Any]) -> dict[str, ModelSection]:
@@ -48,3 +54,20 @@ def show_section(name: str, content: Any, results: Mapping[str, Any], console: C
         console.print(table)
     for remark in section.remarks(content, results):
         console.print(remark, soft_wrap=True)
+
+
+def show(results: Mapping[str, Any], folder: Path) -> None:
+    """Print the sections of every model, the comparison of models and where everything lies."""
+    console = Console(width=None if sys.stdout.isatty() else WIDTH)
+    models = results.get("models", [results])
+    names = short_names([str(model["checkpoint"]) for model in models]) if len(models) > 1 else [""]
+    for name, model in zip(names, models, strict=True):
+        parts = [str(model[key]) for key in ("game", "operator", "activation")]
+        show_section("table", model["table"], results, console, " / ".join([*parts, name] if name else parts))
+        for key in sections.names():
+            if key in model and key not in ("table", "comparison"):
+                show_section(key, model[key], results, console)
+    if "comparison" in results:
+        show_section("comparison", results["comparison"], results, console)
+    spent = ", ".join(f"{part.replace('_', ' ')} {seconds:.0f} s" for part, seconds in results["seconds"].items())
+    console.print(f"Time: {spent}\nResults: {folder / 'results.json'}", soft_wrap=True)

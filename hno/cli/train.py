@@ -4,107 +4,63 @@ from __future__ import annotations
 
 import logging
 import shutil
-from collections.abc import Sequence
+import sys
 from pathlib import Path
 from typing import Any
 
 import lightning as L
-from hydra.core.hydra_config import HydraConfig
 
 from hno.cli import launch
 from hno.cli.arguments import Arguments
-from hno.cli.build import (
-    build_architecture,
-    build_data,
-    build_game,
-    build_objective,
-    build_settings,
-    check,
-)  # fmt: skip
-from hno.cli.checkpoints import resumed
-from hno.cli.evaluate import evaluate_policy, solve_tests, unseen_types
-from hno.cli.logs import (
-    StepLines,
-    finish_wandb,
-    label_progress,
-    loggers,
-    progress_bar,
-    send_lightning_to_hydra,
-    use_threads,
-)
+from hno.cli.build import build, check, how_to_train
+from hno.cli.evaluate import describe, play_starts, solve_tests, unseen_types
+from hno.cli.logs import StepBar, StepLines, label_progress, loggers, use_threads
 from hno.cli.media import publish
-from hno.cli.results import Results, config_hash, plain
-from hno.cli.schema import TrainSettings
+from hno.cli.results import Results, config_hash
 from hno.cli.sections import run_sections
-from hno.cli.starts import cache_folder, label_solver
-from hno.cli.summary import report, show
-from hno.data.certificates import safe_sets, summary
+from hno.cli.settings import TrainSettings
+from hno.data.certificates import safe_sets, summaries
 from hno.data.datamodule import GameData
-from hno.data.labels import Request, safe_labels_for
-from hno.evaluation.sections import Evaluation
+from hno.data.labels import Request, default_cache, safe_labels_for
 from hno.games.grid import parse_types
-from hno.operators import make_operator
-from hno.training.checkpoint import Provenance, check_resumable, load_policy, record
+from hno.training.checkpoint import Provenance, check_resumable, find_checkpoint, load_policy, record
 from hno.training.divergence import DivergedError
-from hno.training.fit import Fitted, fit
+from hno.training.fit import LAST, Fitted, fit
 from hno.training.validation import BEST, PROBE, Later
-from hno.types import Extremal, part
+from hno.types import Extremal
 
 log = logging.getLogger(__name__)
 
 
 def run(given: Arguments) -> int:
     """`hno train`."""
-    return launch.run("train", check, train, given)
+    return launch.run(launch.Task("train", check, head, train), given)
 
 
-def train(settings: TrainSettings) -> bool:
-    """One run; its folder gets best.ckpt, last.ckpt, metrics and results.json.
-
-    Returns:
-        Whether it succeeded. A failure has been logged and is in results.json.
-    """
-    send_lightning_to_hydra()
-    folder = Path(HydraConfig.get().runtime.output_dir)
-    head = {
+def head(settings: TrainSettings) -> dict[str, Any]:
+    """What results.json says from the beginning."""
+    return {
         "game": settings.game.name,
         "operator": settings.operator["name"],
         "activation": settings.activation["name"],
         "seed": settings.seed,
         "steps": settings.trainer.max_steps,
         "config_hash": config_hash(settings),
-        "config": plain(settings),
+        "config": settings.model_dump(),
     }
-    results = Results(folder / "results.json", head)
-    try:
-        _run(settings, folder, results)
-    except Exception as error:
-        results.update(status="failed", reason=f"{type(error).__name__}: {error}")
-        report(error)
-        if isinstance(error, DivergedError) and (folder / BEST).exists():
-            results.update(checkpoint=BEST)
-            log.error("The last good checkpoint is %s.", folder / BEST)
-        return False
-    except (KeyboardInterrupt, SystemExit):  # Lightning turns the one into the other
-        results.update(status="failed", reason="interrupted")
-        raise
-    finally:
-        finish_wandb(results.content)
-    show(results.content, folder)
-    return True
 
 
-def _run(settings: TrainSettings, folder: Path, results: Results) -> None:
+def train(settings: TrainSettings, results: Results) -> None:
+    """One run; its folder gets best.ckpt, last.ckpt, metrics and results.json."""
+    folder = results.path.parent
     fitted = train_operator(settings, folder, results)
-    chosen, policy = plain(settings.evaluation), load_policy(fitted.checkpoint)
-    unseen = unseen_types(policy.game, settings.evaluation.types, "evaluation.types")
-    types = list(dict.fromkeys([*policy.types, *unseen]))
-    solve = label_solver(policy.game, types, chosen, cache_folder(settings.data.cache), settings.data.workers)
-    evaluation = Evaluation(results.content["checkpoint"], policy, policy.types, types, chosen, solve)
-    assessed, _ = evaluate_policy(evaluation, solve_tests(evaluation, results), results)
-    for name, content in run_sections(assessed, results):
+    policy, chosen = load_policy(fitted.checkpoint), settings.evaluation
+    types = [*policy.types, *unseen_types(policy.game, chosen.types, "evaluation.types")]
+    models = [(str(results.content["checkpoint"]), policy)]
+    (evaluation,) = describe(models, types, chosen.model_dump(), settings.data.cache, settings.data.workers)
+    played, _ = play_starts(evaluation, solve_tests(evaluation, results), results)
+    for name, content in run_sections(played, results):
         results.update(**{name: content})
-    results.update(status="finished")
     publish(fitted.trainer.loggers, results.content, folder, fitted.trainer.global_step)
 
 
@@ -112,26 +68,30 @@ def train_operator(settings: TrainSettings, folder: Path, results: Results) -> F
     """Solve labels and train; the folder gets `last.ckpt` and `best.ckpt`, the results how it went and which to use."""
     L.seed_everything(settings.seed, verbose=False)
     use_threads(settings.trainer.threads)
-    game, architecture, objective = build_game(settings.game), build_architecture(settings), build_objective(settings)
-    operator = make_operator(game, architecture)
-    needed = objective.streams(exact_terminal=operator.meets_terminal)
-    data = build_data(settings, game, needed, label_progress())
+    architecture, operator, objective, data = build(settings, label_progress())
     origin = Provenance(settings.operator["name"], data.type_list, settings.seed, config_hash(settings))
-    entries, makers = record(game, architecture, origin), loggers(settings, folder)
-    resume = None if settings.resume is None else resumed(settings.resume)
+    entries, makers = record(data.game, architecture, origin), loggers(settings, folder)
+    resume = None if settings.resume is None else find_checkpoint(settings.resume, [LAST])
     if resume is not None:
         check_resumable(resume, entries)
     _take_over(None if resume is None else resume.parent / BEST, folder / BEST)
 
     data.setup("fit")
     results.time("labels", data.label_seconds)
-    results.update(label_statistics=label_statistics(data.extremals))
+    results.update(label_statistics=summaries(data.extremals))
     first, later = validation_starts(settings, data, results)
     before = results.content["seconds"].get("validation_labels", 0.0)
-    fitted = fit(
-        operator, objective, data, build_settings(settings), folder, validation=first, later=later, record=entries,
-        loggers=makers, callbacks=[progress_bar() or StepLines(settings.trainer.print_every)], resume=resume,
-    )  # fmt: skip
+    bar = StepBar() if sys.stdout.isatty() else StepLines(settings.trainer.print_every)
+    try:
+        fitted = fit(
+            operator, objective, data, how_to_train(settings), folder, validation=first, later=later, record=entries,
+            loggers=makers, callbacks=[bar], resume=resume,
+        )  # fmt: skip
+    except DivergedError:
+        if (folder / BEST).exists():
+            results.update(checkpoint=BEST)
+            log.error("The last good checkpoint is %s.", folder / BEST)
+        raise
     solving = results.content["seconds"].get("validation_labels", 0.0) - before  # while validation played
     results.time("training", fitted.seconds["training"])
     results.time("validation", fitted.seconds["validation"] - solving)
@@ -144,15 +104,6 @@ def train_operator(settings: TrainSettings, folder: Path, results: Results) -> F
     return fitted
 
 
-def label_statistics(labels: Sequence[Extremal]) -> list[dict[str, Any]]:
-    """What the certificates of the training labels say, type by type."""
-    return [
-        {"theta": theta.tolist(), **summary(part(found, (found.theta == theta).all(-1)))}
-        for found in labels
-        for theta in found.theta.unique(dim=0)
-    ]
-
-
 def validation_starts(settings: TrainSettings, data: GameData, results: Results) -> tuple[list[Extremal], Later | None]:
     """Safe starts that closed-loop validation plays: held-out ones, or those of the chosen types.
 
@@ -162,7 +113,7 @@ def validation_starts(settings: TrainSettings, data: GameData, results: Results)
     if choice.types is None:
         return safe_sets(data.held_out(), clearance), None
     types = parse_types(data.game, choice.types, key="validation.types")
-    cache, workers = cache_folder(settings.data.cache), settings.data.workers
+    cache, workers = Path(settings.data.cache or default_cache()), settings.data.workers
 
     def solve(starts: int) -> list[Extremal]:
         requests = [Request(theta, starts, choice.seed, "validation") for theta in types]

@@ -50,6 +50,15 @@ def summary(found: Extremal) -> dict[str, Any]:
     }
 
 
+def summaries(labels: Sequence[Extremal]) -> list[dict[str, Any]]:
+    """The summary of every type in label sets, with its `theta`."""
+    return [
+        {"theta": theta.tolist(), **summary(part(found, (found.theta == theta).all(-1)))}
+        for found in labels
+        for theta in found.theta.unique(dim=0)
+    ]
+
+
 def _largest(values: Tensor) -> float | None:
     return float(values.max()) if len(values) and bool(values.isfinite().all()) else None
 

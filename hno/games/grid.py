@@ -41,6 +41,13 @@ def parse_types(
         ) from error
 
 
+def quarter_types(game: Game) -> list[tuple[float, ...]]:
+    """Four types at quarters of the type box; all players but the first are of one type."""
+    lo, width = game.type_box.lo, game.type_box.hi - game.type_box.lo
+    places = [[first, *[others] * (game.players - 1)] for first, others in ((0, 1), (1, 1), (1, 3), (3, 4))]
+    return game.validate_types([(lo + width * lo.new_tensor(row) / 4).tolist() for row in places])
+
+
 def _lattice(game: Game, count: int) -> list[tuple[float, ...]]:
     """All combinations of `count` equally spaced types of each player."""
     corners, steps = zip(game.type_box.lo.tolist(), game.type_box.hi.tolist(), strict=True), count - 1

@@ -16,6 +16,7 @@ from hno.control.policy import Feedback
 from hno.games import Game, games, make
 from hno.operators import Architecture, Choice, ValueOperator, make_operator
 from hno.pontryagin.threads import torch_threads
+from hno.registry import UnknownNameError
 
 KEY = "hno"
 """Checkpoint entry that says how to build the operator and where it comes from."""
@@ -50,6 +51,25 @@ def record(game: Game, architecture: Architecture, provenance: Provenance) -> di
     return {KEY: content}
 
 
+def find_checkpoint(path: str | Path, names: Sequence[str] = ("best.ckpt", "last.ckpt")) -> Path:
+    """A checkpoint as people name it: a file, or the first of these names that a run's folder has.
+
+    Raises:
+        CheckpointError: there is none.
+    """
+    place = Path(path)
+    files = [place / name for name in names] if place.is_dir() else [place]
+    for file in files:
+        if file.is_file():
+            return file
+    runs = sorted({file.parent.name for name in names for file in place.glob(f"*/{name}")})
+    if runs:
+        advice = f"{place} is the folder of a sweep: name one of its runs, such as {place / runs[0]}"
+        raise CheckpointError(f"{advice}. It holds {', '.join(runs)}.")
+    where = " or ".join(map(str, files))
+    raise CheckpointError(f"There is no checkpoint at {where}. Train one with `hno train`, or name its folder.")
+
+
 def read_checkpoint(path: str | Path) -> dict[str, Any]:
     """The content of a checkpoint, or of the best or last one in a run's folder.
 
@@ -58,13 +78,9 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
     Raises:
         CheckpointError: no such file, truncated, or not written by this version of the package.
     """
-    inside = [Path(path) / name for name in ("best.ckpt", "last.ckpt")]
-    if Path(path).is_dir():
-        path = next((file for file in inside if file.exists()), inside[0])
+    path = find_checkpoint(path)
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
-    except FileNotFoundError as error:
-        raise CheckpointError(f"There is no checkpoint at {path}. Train one with `python train.py`.") from error
     except _UNREADABLE as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise CheckpointError(
@@ -125,6 +141,11 @@ def load_operator(path: str | Path, game: str | None = None) -> tuple[ValueOpera
     found = content[KEY]
     if game is not None and found["game"] != game:
         raise CheckpointError(f"{path} is a checkpoint of game {found['game']!r}, expected {game!r}.")
+    if found["game"] not in games.names():
+        raise UnknownNameError(
+            f"{path} is of the game {found['game']!r}, which is not registered here. If a script of your own registers "
+            f"it, import that script first. Known: {', '.join(games.names())}."
+        )
     built = make(found["game"], **found["constants"])
     if built.fingerprint() != found["fingerprint"]:
         raise CheckpointError(f"{path} was trained on another version of the game {found['game']!r}. Train it again.")

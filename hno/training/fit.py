@@ -122,7 +122,7 @@ def fit(
         operator.set_branches(data.train_rows.types.branch)
     watch = ClosedLoopValidation(folder, settings.validate_every, dt=settings.dt, stop=settings.stop_when_safe)
     watch.begin(safe_sets(data.held_out()) if validation is None else validation, later)
-    trainer = make_trainer(settings, folder, loggers, [watch, *callbacks])
+    trainer = make_trainer(settings, folder, loggers, [watch, *callbacks], validates=data.val_rows is not None)
     began = time.perf_counter()
     trainer.fit(module, datamodule=data, ckpt_path=resume, weights_only=True)
     if settings.polish:
@@ -141,9 +141,9 @@ def fit(
 
 
 def make_trainer(
-    settings: Settings, folder: Path, loggers: Sequence[Logger], callbacks: Sequence[L.Callback]
+    settings: Settings, folder: Path, loggers: Sequence[Logger], callbacks: Sequence[L.Callback], *, validates: bool
 ) -> L.Trainer:
-    """A trainer that runs for a number of steps and leaves `last.ckpt` in the folder."""
+    """A trainer that runs for a number of steps and leaves `last.ckpt`; it validates where there are held-out rows."""
     every = settings.validate_every
     keeping_last = ModelCheckpoint(
         folder, Path(LAST).stem, every_n_train_steps=every, save_on_train_epoch_end=False, enable_version_counter=False
@@ -156,6 +156,7 @@ def make_trainer(
         max_epochs=-1,
         gradient_clip_val=settings.gradient_clip_val,
         val_check_interval=min(every, settings.steps),
+        limit_val_batches=1.0 if validates else 0,  # Lightning warns of a loader without rows
         check_val_every_n_epoch=None,
         num_sanity_val_steps=0,
         log_every_n_steps=max(1, min(50, settings.steps)),

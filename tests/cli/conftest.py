@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import pytest
 import torch
 
-from hno.cli import evaluate, pages, starts, train
+from hno.cli import evaluate, pages, train
 from hno.cli.main import main
 from hno.data import datamodule
 from hno.games import Game, make
@@ -101,7 +101,7 @@ def no_labels(monkeypatch: pytest.MonkeyPatch) -> None:
         raise AssertionError("labels were asked for")
 
     for module, name in (
-        (datamodule, "labels_for"), (starts, "labels_for"), (starts, "safe_labels_for"), (train, "safe_labels_for"),
+        (datamodule, "labels_for"), (evaluate, "labels_for"), (evaluate, "safe_labels_for"), (train, "safe_labels_for"),
     ):  # fmt: skip
         monkeypatch.setattr(module, name, never)
 

@@ -14,7 +14,6 @@ def test_flags_may_stand_anywhere() -> None:
     assert given.overrides == ["game=drone", "seed=1,2", "~seed"]
     assert given.words == ["word"]
     assert given.flags == {"--multirun": "", "--to": "out put", "--config-dir": "mine"}
-    assert given.hydra == ["--multirun", "--config-dir", "mine"]
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -38,3 +41,20 @@ def test_a_game_keeps_its_constants_and_mistakes_are_errors(tmp_path: Path) -> N
         hno.train(make("narrow_road", radius=1.5), "hno", tmp_path, TINY)
     found = json.loads((tmp_path / "results.json").read_text())
     assert (found["status"], found["reason"]) == ("failed", "AssertionError: labels were asked for")
+
+
+@pytest.mark.usefixtures("cache")
+def test_a_training_prints_nothing(tmp_path: Path) -> None:
+    code = f"import hno; hno.train('narrow_road', 'hno', {str(tmp_path)!r}, {TINY!r})"
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=os.environ | {"PYTHONPATH": str(Path(hno.__file__).parents[1])},
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+@pytest.mark.usefixtures("no_labels")
+def test_a_method_that_does_not_exist_is_answered_with_the_methods(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"^No method named 'hmo'\. Known: hno, sno.* Did you mean 'hno'\?$") as error:
+        hno.train("narrow_road", "hmo", tmp_path, TINY)
+    assert "gradient" not in str(error.value)

@@ -8,16 +8,16 @@ import pytest
 from omegaconf import DictConfig
 
 from hno.cli.arguments import Arguments
-from hno.cli.build import build_architecture, build_data, build_game, build_objective, check
+from hno.cli.build import build, check
 from hno.cli.calls import train_settings
 from hno.cli.config import choices, compose, config_dir, for_hydra, groups, register_plugins
+from hno.cli.main import main
 from hno.cli.results import config_hash
-from hno.cli.schema import TrainSettings
+from hno.cli.settings import TrainSettings
 from hno.data import GameData
 from hno.data.exchange import write_own
 from hno.games import make
 from hno.losses import STREAMS
-from hno.operators import make_operator
 from tests.fakes import fake_labels
 
 GROUPS = sorted(path.name for path in config_dir().iterdir() if path.is_dir())
@@ -41,9 +41,7 @@ def settings(*overrides: str) -> TrainSettings:
 
 
 def data_of(chosen: TrainSettings) -> GameData:
-    game = build_game(chosen.game)
-    operator = make_operator(game, build_architecture(chosen))
-    return build_data(chosen, game, build_objective(chosen).streams(exact_terminal=operator.meets_terminal))
+    return build(chosen).data
 
 
 @pytest.mark.parametrize(("group", "choice"), CHOICES)
@@ -133,6 +131,22 @@ def test_an_experiment_may_have_entries_of_its_own_and_no_command_line_may(tmp_p
     assert check(compose("train", for_hydra("train", given))).optimizer["lr"] == 0.5
     with pytest.raises(ValueError, match=r"mine does not exist"):
         settings("mine.rate=0.5")
+
+
+@pytest.mark.parametrize("words", [("train",), ("labels", "theta=1,1", "n=1")], ids=lambda words: words[0])
+def test_a_misspelt_section_of_a_games_file_is_an_error(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...]
+) -> None:
+    """Also where the command reads no such section: what is right for a training says nothing to it."""
+    (tmp_path / "game").mkdir()
+    file = tmp_path / "game" / "mine.yaml"
+    head = "# @package _global_\ngame: {name: narrow_road, constants: {}}\n"
+    given = [*words, "game=mine", "--config-dir", str(tmp_path), "--dry-run"]
+    file.write_text(head + "evaluation: {starts: 3}\n")
+    assert main(given) == 0
+    file.write_text(head + "evaluatoin: {starts: 3}\n")
+    assert main(given) == 1
+    assert "evaluatoin does not exist" in capsys.readouterr().err
 
 
 def test_paper_recipe_is_the_published_one() -> None:

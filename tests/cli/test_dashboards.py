@@ -155,10 +155,11 @@ def test_tensorboard_that_is_not_installed(command: Command, monkeypatch: pytest
     ("override", "message"),
     [
         *(
-            (f"logger.names={names}", "logger.names must be a list of csv, tensorboard, wandb")
-            for names in ("[csv,tensorbord]", "[csv,7]", "csv", "null")
+            (f"logger.names=[csv,{name}]", "logger.names.1 must be 'csv', 'tensorboard' or 'wandb'")
+            for name in ("tensorbord", "7")
         ),
-        ("logger.mode=onlin", "logger.mode must be one of auto, disabled, offline, online"),
+        *((f"logger.names={names}", "logger.names must be a valid list") for names in ("csv", "null")),
+        ("logger.mode=onlin", "logger.mode must be 'auto', 'disabled', 'offline' or 'online'; got 'onlin'"),
         ("logger.mode=online", "W&B has no API key to run online"),
     ],
 )

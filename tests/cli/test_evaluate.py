@@ -116,7 +116,7 @@ def test_impossible_types(command: Command, random_checkpoint: Path, theta: str,
         ("starts=0", "starts must be"),
         ("starts=-4", "starts must be"),
         *((f"{name}=true", f"{name} must be a") for name in ("starts", "seed", "workers", "delay", "noise", "widen")),
-        ("starts=null", "starts must be"),
+        ("starts=null", "starts must be a valid integer"),
         ("dt=0", "dt must be"),
         ("dt=5", "divides the horizon"),
         ("clearance=-1", "clearance must be"),
@@ -125,9 +125,9 @@ def test_impossible_types(command: Command, random_checkpoint: Path, theta: str,
         ("start=5", "Did you mean 'starts'?"),
         ("checkpoint=/nowhere/last.ckpt", "There is no checkpoint at /nowhere/last.ckpt"),
         ("checkpoint=[/nowhere/last.ckpt]", "There is no checkpoint at /nowhere/last.ckpt"),
-        ("checkpoint=[]", "checkpoint must be a checkpoint, the folder of a run, or a list of them"),
-        ("residuals=yes please", "residuals must be true or false"),
-        ("robustness=1", "robustness must be true or false"),
+        ("checkpoint=[]", "checkpoint must have at least 1 item"),
+        ("residuals=yes please", "residuals must be a valid boolean"),
+        ("robustness=1", "robustness must be a valid boolean"),
     ],
 )
 def test_impossible_settings(command: Command, random_checkpoint: Path, override: str, message: str) -> None:
@@ -137,6 +137,27 @@ def test_impossible_settings(command: Command, random_checkpoint: Path, override
 @pytest.mark.usefixtures("no_labels")
 def test_without_a_checkpoint(command: Command) -> None:
     refused(command("evaluate"), "checkpoint is missing: give it as checkpoint=<value>")
+
+
+@pytest.mark.usefixtures("no_labels")
+def test_the_folder_of_a_sweep_is_no_checkpoint(command: Command, tmp_path: Path) -> None:
+    for name in ("0_sno", "1_hno"):
+        (tmp_path / "sweep").mkdir(exist_ok=True)
+        save_random(tmp_path / "sweep" / name / "last.ckpt")
+    sweep = tmp_path / "sweep"
+    run = command("evaluate", f"checkpoint={sweep}")
+    refused(run, f"{sweep} is the folder of a sweep: name one of its runs, such as {sweep}/0_sno", "0_sno, 1_hno.")
+    refused(command("train", *SMOKE, f"resume={sweep}"), f"{sweep} is the folder of a sweep")
+
+
+@pytest.mark.usefixtures("no_labels")
+def test_the_game_of_a_script_is_registered_by_importing_it(command: Command, tmp_path: Path) -> None:
+    path = save_random(tmp_path / "random" / "last.ckpt")
+    content = torch.load(path, weights_only=True)
+    content["hno"]["game"] = "crossing"
+    torch.save(content, path)
+    run = command("evaluate", f"checkpoint={path}")
+    refused(run, "'crossing', which is not registered here", "import that script first", "Known: ", "narrow_road")
 
 
 @pytest.mark.usefixtures("no_labels")
@@ -182,7 +203,7 @@ def other(checkpoint: Path, folder: Path, game: str = "narrow_road", seed: int =
 
 def test_results_hold_the_configuration(command: Command, random_checkpoint: Path) -> None:
     config = command("evaluate", f"checkpoint={random_checkpoint}", "theta=1,1", "noise=0.1", *FAST).results["config"]
-    assert (config["checkpoint"], config["theta"], config["noise"]) == (str(random_checkpoint), "1,1", 0.1)
+    assert (config["checkpoint"], config["theta"], config["noise"]) == ([str(random_checkpoint)], "1,1", 0.1)
     assert (config["starts"], config["residuals"]) == (4, True)
 
 

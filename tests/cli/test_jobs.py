@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from hno.cli import pages, train
+from hno.cli import launch, pages
 from hno.cli.sweep import Job, show_jobs
 from tests.cli.conftest import SMOKE, Command, Outcome
 from tests.report.tables import type_row
@@ -75,11 +75,11 @@ def test_a_job_without_readable_results_is_a_failed_one(
 
 def test_a_failed_job_is_in_the_table_with_its_reason_and_the_others_go_on(command: Command, tmp_path: Path) -> None:
     sweep = tmp_path / "sweep"
-    run = command("train", "-m", f"hydra.sweep.dir={sweep}", *SMOKE, "trainer.max_steps=2", "optimizer.lr=inf,0.001")
+    run = command("train", "-m", f"hydra.sweep.dir={sweep}", *SMOKE, "trainer.max_steps=2", "optimizer.lr=1e30,0.001")
     assert run.code == 1
     table = run.text[run.text.index("2 jobs") :]
     assert [(row[0], row[5], row[-1]) for row in lines(table)] == [
-        ("0", "optimizer.lr=inf", "failed"), ("1", "optimizer.lr=0.001", "finished"),
+        ("0", "optimizer.lr=1e+30", "failed"), ("1", "optimizer.lr=0.001", "finished"),
     ]  # fmt: skip
     assert "Job 0 failed: DivergedError: " in table
     assert table.splitlines()[-1] == f"Page: {sweep}"
@@ -104,13 +104,13 @@ def test_an_interrupted_multirun_shows_what_there_is(
 ) -> None:
     outcomes = iter([True, KeyboardInterrupt()])
 
-    def task(config: object) -> bool:
+    def perform(*job: object) -> bool:
         outcome = next(outcomes)
         if isinstance(outcome, BaseException):
             raise outcome
         return outcome
 
-    monkeypatch.setattr(train, "train", task)
+    monkeypatch.setattr(launch, "perform", perform)
     printed: list[int] = []
     monkeypatch.setattr("hno.cli.launch.show_jobs", lambda jobs: printed.extend(job.number for job in jobs))
     run = command("train", "-m", f"hydra.sweep.dir={tmp_path}/sweep", *SMOKE, "seed=0,1,2")
@@ -135,7 +135,7 @@ def test_a_failed_run_has_a_page_with_its_reason(command: Command, monkeypatch: 
 def test_a_job_that_is_refused_leaves_its_reason_and_no_page(
     command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(train, "train", lambda settings: True)
+    monkeypatch.setattr(launch, "perform", lambda *job: True)
     sweep = f"hydra.sweep.dir={tmp_path}/sweep"
     run = command("train", "-m", sweep, *SMOKE, "operator=hno,sno", "loss.weights.residual=0.1")
     assert run.code == 1

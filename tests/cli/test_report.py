@@ -48,10 +48,17 @@ def test_a_folder_that_cannot_be_written_ends_with_one(tmp_path, capsys):
     assert "file" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("text", ["0", "-3", "nan", "soon"])
-def test_seconds_that_make_no_sense_are_refused(tmp_path, text, capsys):
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        *((text, f"greater than or equal to 1; got {text}") for text in ("0", "-3")),
+        ("nan", "a finite number"),
+        ("soon", "a valid number; got 'soon'"),
+    ],
+)
+def test_seconds_that_make_no_sense_are_refused(tmp_path, text, expected, capsys):
     assert main(["report", str(tmp_path), f"watch={text}"]) != 0
-    assert "watch must be a number of seconds of at least 1; got " in capsys.readouterr().err
+    assert f"watch must be {expected}" in capsys.readouterr().err
 
 
 def test_a_missing_package_is_named_with_the_remedy(tmp_path, monkeypatch, capsys):

@@ -12,12 +12,12 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 from wandb.sdk.launch.sweeps.utils import create_sweep_command, create_sweep_command_args
 
-from hno.cli import train
+from hno.cli import launch
 from hno.cli.arguments import Arguments
 from hno.cli.build import check
 from hno.cli.config import compose, for_hydra
 from hno.cli.media import numbers
-from hno.cli.schema import TrainSettings
+from hno.cli.settings import TrainSettings
 from hno.games import games
 from tests.cli.conftest import SMOKE, Command
 from tests.cli.test_train import losses
@@ -98,7 +98,7 @@ def grid(command: Command, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> I
     def jobs(*overrides: str) -> Grid:
         made: Grid = []
 
-        def take(chosen: TrainSettings) -> bool:
+        def take(task: launch.Task, chosen: TrainSettings, folder: Path) -> bool:
             tests, names = chosen.evaluation, (chosen.operator["name"], chosen.activation["name"])
             made.append((
                 chosen.game.name, *names, chosen.seed, chosen.optimizer["lr"], tests.starts, tests.safe,
@@ -106,8 +106,8 @@ def grid(command: Command, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> I
             ))  # fmt: skip
             return True
 
-        monkeypatch.setattr(train, "train", take)
-        monkeypatch.setattr("hno.cli.launch.show_jobs", lambda jobs: None)
+        monkeypatch.setattr(launch, "perform", take)
+        monkeypatch.setattr(launch, "show_jobs", lambda jobs: None)
         run = command("train", *overrides, "experiment=paper_grid", f"hydra.sweep.dir={tmp_path}/sweep")
         assert run.code == 0, run.text
         return made

@@ -5,9 +5,9 @@ import json
 import pytest
 import torch
 
-from hno.data.certificates import CLEARANCE, GLOBAL_GAP, LOCAL_GAP, inevitable, safe, summary
+from hno.data.certificates import CLEARANCE, GLOBAL_GAP, LOCAL_GAP, inevitable, safe, summaries, summary
 from hno.games import make
-from hno.types import Extremal, Status
+from hno.types import Extremal, Status, join, part
 from tests.fakes import fake_labels
 
 CLEARANCES = [0.5, CLEARANCE, 0.019, 0.0, -0.3, 0.5, -0.3]
@@ -72,3 +72,13 @@ def test_without_a_converged_row_there_is_no_worst_one() -> None:
     counts = summary(fake_labels(make("narrow_road"), status=[Status.MAX_STEPS] * 4))
     assert [value for name, value in counts.items() if name.startswith("largest")] == [None] * 4
     assert [counts[name] for name in ("safe", "inevitable", "above_local_gap", "above_global_gap")] == [0] * 4
+
+
+def test_summaries_are_those_of_each_type() -> None:
+    """A file of one's own may hold several types in any order."""
+    game, failed = make("narrow_road"), [Status.STALLED] * 2
+    mixed = join([fake_labels(game, (1.0, 1.0), 3), fake_labels(game, (2.0, 1.0), 2, status=failed)])
+    found = summaries([part(mixed, torch.tensor([0, 3, 1, 4, 2])), fake_labels(game, (5.0, 5.0), 1)])
+    assert [(e["theta"], e["starts"], e["status"]["stalled"], e["safe"]) for e in found] == [
+        ([1, 1], 3, 0, 3), ([2, 1], 2, 2, 0), ([5, 5], 1, 0, 1),
+    ]  # fmt: skip

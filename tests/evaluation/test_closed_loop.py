@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from hno.cli.summary import show
+from hno.cli.sections import show
 from hno.control.rollout import Disturbance, rollout
 from hno.evaluation.closed_loop import CollisionTable, TypeRow, verdict
 from hno.types import Extremal, Field, Points, Status

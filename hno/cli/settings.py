@@ -1,0 +1,165 @@
+"""The settings of every command."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, Field
+
+from hno.cli import schema
+from hno.cli.schema import Amount, Count, Loose, Positive, Seed, Settings, Share, Size, Text
+
+
+class GameSettings(Settings):
+    """Which game, and constants that differ from its defaults."""
+
+    name: Text
+    constants: dict[str, Any]
+
+
+class BatchSizes(Settings):
+    """Rows per step of each stream; null for every labelled row."""
+
+    bvp: Size | None
+    interior: Size | None
+    terminal: Size | None
+
+
+class DataSettings(Settings):
+    """Labels and the curriculum."""
+
+    types: Loose | None
+    trajectories: Size
+    validation: Size
+    batch_sizes: BatchSizes
+    pretrain: Share
+    widening: Share
+    finish: Share
+    interior_types: Literal["labelled", "box"]
+    cache: Text | None
+    files: list[Text]
+    workers: Size | None
+
+
+class LossSettings(Settings):
+    """A method: its terms and weights; null removes one."""
+
+    terms: schema.Terms
+    weights: schema.Weights
+    norm: Literal["huber", "l1", "l2"]
+    scaled: bool
+    balance: bool
+    hardest: Annotated[float, Field(gt=0, le=1)]
+
+
+class TrainerSettings(Settings):
+    """How long and on what."""
+
+    max_steps: Size
+    accelerator: Text
+    devices: Loose
+    precision: Loose
+    compile: bool
+    gradient_clip_val: Positive | None
+    polish: Count
+    validate_every: Size
+    print_every: Size
+    threads: Size | None
+
+
+class LoggerSettings(Settings):
+    """Where metrics go."""
+
+    names: list[Literal["csv", "tensorboard", "wandb"]]
+    project: Text
+    mode: Literal["auto", "disabled", "offline", "online"]
+
+
+class Episodes(Settings):
+    """Under which conditions a policy is played."""
+
+    starts: Size
+    seed: Seed
+    clearance: Amount
+    dt: Positive
+    safe: bool
+    widen: Positive
+    noise: Amount
+    delay: Count
+    ntk: bool
+    ntk_rows: Size
+
+
+class EvaluationSettings(Episodes):
+    """The evaluation at the end of a training."""
+
+    types: Loose | None
+
+
+class ValidationSettings(Settings):
+    """Closed-loop validation while an operator trains."""
+
+    types: Loose | None
+    starts: Size
+    stop_when_safe: bool
+    seed: Seed
+
+
+class TrainSettings(Settings):
+    """`hno train`."""
+
+    game: GameSettings
+    operator: schema.Operator
+    network: schema.Network
+    activation: schema.Activation
+    data: DataSettings
+    sampler: schema.Sampler
+    loss: LossSettings
+    optimizer: schema.Optimizer
+    trainer: TrainerSettings
+    logger: LoggerSettings
+    evaluation: EvaluationSettings
+    validation: ValidationSettings
+    seed: Seed
+    resume: Text | None
+
+
+class EvaluateSettings(Episodes):
+    """`hno evaluate`."""
+
+    checkpoint: Annotated[
+        list[Text], Field(min_length=1), BeforeValidator(lambda given: [given] if isinstance(given, str) else given)
+    ]
+    expected_game: Text | None
+    theta: Loose | None
+    unseen: Loose | None
+    residuals: bool
+    robustness: bool
+    conditions: dict[str, Any]
+    online: Count
+    online_interval: Size
+    cache: Text | None
+    workers: Size | None
+    threads: Size | None
+
+
+class LabelSettings(Settings):
+    """`hno labels`."""
+
+    game: GameSettings
+    theta: Loose | None
+    n: Size
+    seed: Seed
+    split: Literal["train", "test"]
+    widen: Positive
+    workers: Size | None
+    cache: Text | None
+
+
+class ReportSettings(Settings):
+    """`hno report`."""
+
+    folder: Text
+    to: Text | None
+    figures: bool
+    watch: Annotated[float, Field(ge=1)] | None
