@@ -57,7 +57,7 @@ def _report(settings: ReportSettings) -> None:
 
     folder = Path(settings.folder)
     if settings.figures:
-        from hno.report.figures import write_figures
+        from hno.report.pictures import write_figures
 
         for path in write_figures(load(folder), Path(settings.to or folder / "figures")):
             print(path)

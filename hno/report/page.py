@@ -21,6 +21,7 @@ from hno.report.records import Run
 from hno.report.runs import Sweep
 from hno.report.tables import (
     CACHED,
+    FILTERS,
     Table,
     label_tables,
     mapping_table,
@@ -33,7 +34,6 @@ from hno.report.tables import (
 
 EPISODES = 400
 """Episodes of a page, at most."""
-FILTERS = ("game", "operator", "activation", "seed")
 
 
 def write_page(sweep: Sweep, path: Path, refresh: float | None = None) -> None:
@@ -112,16 +112,12 @@ def _choices(runs: Sequence[Run], name: str) -> list[str]:
 def _settings(runs: Sequence[Run], found: Sequence[Recipe]) -> tuple[dict[str, str | None], Table]:
     """Settings and versions that all runs share, and a table of the others by recipe."""
     said = {run.name: {**run.settings, **{f"version of {p}": v for p, v in run.versions.items()}} for run in runs}
-    values = {
-        key: {one.get(key) for one in said.values()}
-        for key in dict.fromkeys(key for one in said.values() for key in one)
-    }
+    keys = dict.fromkeys(key for one in said.values() for key in one)
+    values = {key: {one.get(key) for one in said.values()} for key in keys}
     differing = [key for key, some in values.items() if len(some) > 1 and key != "seed"]
     rows = [
         {"game": one.game, "recipe": one.name, **{key: said[one.runs[0].name].get(key) for key in differing}}
         for one in found
-        if one.runs
+        if one.runs and differing
     ]
-    return {key: next(iter(some)) for key, some in values.items() if len(some) == 1}, mapping_table(
-        rows if differing else []
-    )
+    return {key: next(iter(some)) for key, some in values.items() if len(some) == 1}, mapping_table(rows)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from hno.evaluation.format import NOT_AVAILABLE, counted, interval, percent, signed, types
+from hno.evaluation.format import NOT_AVAILABLE, at, counted, interval, percent, signed
 from hno.evaluation.outcome import Pooled
 from hno.report.episode import Episode
 from hno.report.recipes import Recipe, Spread, rivals
@@ -15,11 +15,6 @@ from hno.report.runs import Sweep
 def share(found: Pooled) -> str:
     """Collisions of starts, in short."""
     return f"{found.collisions:,} of {found.safe_starts:,}: {percent(found.rate)}"
-
-
-def at(theta: Sequence[float]) -> str:
-    """Player types."""
-    return f"({types(theta)})"
 
 
 def clearance(found: Episode, unit: str) -> str:
