@@ -53,6 +53,7 @@ def _episode(game: Game, played: Trajectory, label: Extremal, row: int) -> dict[
     closest = int(violation.nan_to_num(-math.inf).argmax())
     frames = sorted({*range(0, len(played.t), math.ceil(len(played.t) / FRAMES)), closest})
     t, places = played.t[frames], game.positions(played.x[row, frames])
+    apart = separation(places).amin(-1) if game.players > 1 and game.distance_constraints else None
     return {
         "theta": [float(entry) for entry in theta],
         "collided": bool(played.collided[row]),
@@ -62,16 +63,9 @@ def _episode(game: Game, played: Trajectory, label: Extremal, row: int) -> dict[
         "label_cost": _rounded(label.cost[row]),
         "t": _rounded(t),
         "positions": _rounded(places),
-        "radius": _radius(game, places, violation[frames]),
+        "radius": None if apart is None else _rounded(violation[frames] + apart),
         "label_positions": _rounded(_at(t, label.t, game.positions(label.x[row].to(places)))),
     }
-
-
-def _radius(game: Game, places: Tensor, violation: Tensor) -> Any:
-    """Distance of players below which it is a collision at each time, m; None where the constraint is no distance."""
-    if game.players == 1 or not game.distance_constraints:
-        return None
-    return _rounded(violation + separation(places).amin(-1))
 
 
 def _at(times: Tensor, t: Tensor, places: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ from hno.report.episode import Episode, closest, frames, whole
 from hno.report.recipes import Recipe
 from hno.report.records import Run
 from hno.report.tables import Row, names_of
-from hno.report.verdicts import clearance, seeds, share
+from hno.report.verdicts import clearance, share
 
 POINTS = 120
 """Points of a learning curve, at most."""
@@ -41,7 +41,7 @@ def comparison(recipes: Iterable[Recipe]) -> list[Row]:
 
 def _rates(recipe: Recipe) -> list[Row]:
     whole, (low, high) = recipe.pooled, recipe.pooled.interval or (None, None)
-    tip = f"{recipe.name}, {seeds(recipe)}\n{share(whole)}\n95 % interval {interval(whole.interval)}"
+    tip = f"{recipe.name}, {recipe.seeds}\n{share(whole)}\n95 % interval {interval(whole.interval)}"
     count = f"{whole.collisions:,} of {whole.safe_starts:,}"
     rows: list[Row] = [{"seed": None, "rate": whole.rate, "low": low, "high": high, "count": count, "tip": tip}]
     for run, own in zip(recipe.runs, recipe.by_seed, strict=True):

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from scipy.stats import t as student
 
-from hno.evaluation.format import NOT_AVAILABLE
+from hno.evaluation.format import NOT_AVAILABLE, counted
 from hno.evaluation.outcome import Pooled, pooled
 from hno.report.records import Row, Run
 
@@ -82,6 +82,11 @@ class Recipe:
     def name(self) -> str:
         """Operator, activation and what else is special."""
         return " / ".join(filter(None, (self.operator, self.activation, self.variant)))
+
+    @property
+    def seeds(self) -> str:
+        """How many seeds count, in words."""
+        return counted(len(self.runs), "seed")
 
     @property
     def special(self) -> str:

@@ -36,11 +36,6 @@ def over_seeds(found: Spread | None) -> str:
     return f"{signed(found.mean)} ({signed(low)} to {signed(high)}, {found.seeds} seeds)"
 
 
-def seeds(recipe: Recipe) -> str:
-    """How many seeds count."""
-    return counted(len(recipe.runs), "seed")
-
-
 def jobs(sweep: Sweep) -> str:
     """How many jobs ended how."""
     finished = sum(run.finished for run in sweep.runs)
@@ -68,7 +63,7 @@ def verdict(recipe: Recipe, recipes: Sequence[Recipe]) -> str:
     names = ", ".join(others[:3]) + (f" and {len(others) - 3} more" if len(others) > 3 else "")
     rest = f" Not told apart from {names}: the intervals overlap." if others else ""
     return (
-        f"{judged} ({seeds(recipe)}, {recipe.conditions}): 95 % interval {interval(whole.interval)}.{told} "
+        f"{judged} ({recipe.seeds}, {recipe.conditions}): 95 % interval {interval(whole.interval)}.{told} "
         f"Joint cost above the equilibrium's: {over_seeds(recipe.excess)}.{rest}"
     )
 

@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from hno.control.rollout import Disturbance
-from hno.evaluation.latency import latency
-from hno.evaluation.online import compare, safe_starts
+from hno.evaluation.online import compare, latency, safe_starts
 from hno.pontryagin import solve
 from hno.types import Extremal, Status
 from tests.fakes import fake_labels
