@@ -187,7 +187,7 @@ def evaluate_policy(evaluation: Evaluation, labels: Sequence[Extremal], results:
     """Play from the starts of the labels, put the table into the results, keep some episodes and draw one."""
     found, table = assess(evaluation, labels, results)
     folder, game = results.path.parent, found.game
-    kept = episodes(game, found.played, labels, found.clearance)
+    kept = episodes(found)
     write_json(folder / EPISODES, kept)
     conditions = {name: found.options[name] for name in ("clearance", "dt", "widen", "noise", "delay")}
     results.update(**conditions, constraint_unit=game.constraint_unit, table=table, episodes=EPISODES)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,6 +10,7 @@ import torch
 from torch import Tensor
 
 from hno.data.certificates import safe
+from hno.evaluation.sections import Evaluation
 from hno.games import Game
 from hno.games.kinematics import separation
 from hno.types import Extremal, Trajectory
@@ -21,23 +21,18 @@ FRAMES = 50
 """An episode is kept at about so many times, and where players are closest."""
 
 
-def episodes(game: Game, played: Sequence[Trajectory], labels: Sequence[Extremal], clearance: float) -> dict[str, Any]:
+def episodes(evaluation: Evaluation) -> dict[str, Any]:
     """The worst and the typical episode of every type, among the starts that count.
-
-    Args:
-        game: the game.
-        played: episodes from the start states of the labels, one set per type.
-        labels: one set per type.
-        clearance: what the label must keep for its start to count, in the unit of the game's constraint.
 
     Returns:
         JSON content: positions of all players over time, the distance below which it is a collision where the
         constraint is one, the path of the equilibrium from the same start, costs. Types without a start that counts
         are left out.
     """
+    game, played = evaluation.game, evaluation.played
     kept = []
-    for found, part in zip(labels, played, strict=True):
-        counted = safe(found, clearance).nonzero().squeeze(-1)
+    for found, part in zip(evaluation.labels, played, strict=True):
+        counted = safe(found, evaluation.clearance).nonzero().squeeze(-1)
         if len(counted):
             near = part.clearance[counted]
             chosen = {"worst": near.argmin(), "typical": near.argsort()[len(near) // 2]}  # NaN is the smallest

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from hno.control.policy import Policy, as_policy
 from hno.control.receding_horizon import RecedingHorizon
-from hno.control.rollout import Disturbance, Player, rollout
-from hno.data.certificates import CLEARANCE, safe
+from hno.control.rollout import Player, rollout
+from hno.data.certificates import safe
 from hno.evaluation import format as text
 from hno.evaluation.closed_loop import play
 from hno.evaluation.outcome import Outcome, outcomes
@@ -35,35 +35,22 @@ def safe_starts(labels: Sequence[Extremal], count: int, clearance: float) -> lis
     return [part(found, safe(found, clearance).nonzero().squeeze(-1)[:count]) for found in labels]
 
 
-def compare(
-    game: Game,
-    policy: Player,
-    labels: Sequence[Extremal],
-    types: Sequence[Sequence[float]],
-    interval: int = 1,
-    dt: float = 0.02,
-    disturbance: Disturbance = Disturbance(),
-    clearance: float = CLEARANCE,
-) -> list[dict[str, Any]]:
+def compare(evaluation: Evaluation, labels: Sequence[Extremal], interval: int = 1) -> list[dict[str, Any]]:
     """Play every start of the labels with both controllers.
 
     Args:
-        game: the game.
-        policy: feedback controls of all players.
+        evaluation: the policy, and how it is played.
         labels: one set per type, at least one row in all.
-        types: player types of each set.
         interval: control steps between the solves of the receding-horizon controller.
-        dt: time for which a control is held, s.
-        disturbance: of the episodes, the same for both.
-        clearance: what the label must keep for its start to count, in the unit of the game's constraint.
 
     Returns:
         One line per type and a last one, of theta None, for all of them: the `Outcome` of each of `CONTROLLERS`, and
         the counts of `SOLVES`.
     """
+    game, dt, disturbance = evaluation.game, evaluation.dt, evaluation.condition.disturbance
     solver, found = RecedingHorizon(game, interval), dict[str, list[Outcome]]()
-    for name, controller in (("policy", policy), ("solver", solver)):
-        by_type, whole = outcomes(game, labels, play(game, controller, labels, dt, disturbance), clearance)
+    for name, controller in (("policy", evaluation.policy), ("solver", solver)):
+        by_type, whole = outcomes(game, labels, play(game, controller, labels, dt, disturbance), evaluation.clearance)
         found[name] = [*by_type, whole]
     rows = torch.arange(len(solver.solves))
     sets = [*rows.split([len(one.status) for one in labels]), rows]
@@ -73,7 +60,7 @@ def compare(
             **{name: results[place]._asdict() for name, results in found.items()},
             "solves": {name: int(getattr(solver, name)[sets[place]].sum()) for name in SOLVES},
         }
-        for place, theta in enumerate([*types, None])
+        for place, theta in enumerate([*evaluation.types, None])
     ]
 
 
@@ -164,17 +151,16 @@ class Online(ModelSection):
 
     def compute(self, evaluation: Evaluation) -> dict[str, Any]:
         """Both controllers on the first `online` safe starts of every type, and the latency of both."""
-        game, policy, dt, clearance = evaluation.game, evaluation.policy, evaluation.dt, evaluation.clearance
+        game, dt = evaluation.game, evaluation.dt
         count, every = evaluation.options["online"], evaluation.options["online_interval"]
         content = {"starts_per_type": count, "interval": every, "dt": dt, "table": [], "latency": None}
-        chosen = safe_starts(evaluation.labels, count, clearance)
+        chosen = safe_starts(evaluation.labels, count, evaluation.clearance)
         total = sum(len(found.status) for found in chosen)
         if total == 0:
             return content | {"reason": "no start has a safe equilibrium"}
         log.info("Playing %d starts by solving the rest of the game every %g s.", total, every * dt)
-        disturbance = evaluation.condition.disturbance
-        table = compare(game, policy, chosen, evaluation.types, every, dt, disturbance, clearance)
-        learned = latency(game, lambda: policy, chosen, dt=dt)
+        table = compare(evaluation, chosen, every)
+        learned = latency(game, lambda: evaluation.policy, chosen, dt=dt)
         online = latency(game, lambda: RecedingHorizon(game, every), chosen, every, dt)
         spent = {"policy": learned._asdict(), "solver": online._asdict()}
         return content | {"table": table, "latency": spent, "reason": None}
