@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from types import SimpleNamespace
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from hno.control import Policy, as_policy
 from hno.control.rollout import Disturbance, Player
-from hno.evaluation.closed_loop import TypeRow, ValueField, collision_table, play
+from hno.evaluation.closed_loop import TypeRow, collision_table, play
+from hno.evaluation.sections import Evaluation
 from hno.games import Game
 from hno.operators import Architecture, Choice
 from hno.pontryagin.mesh import label_times
 from hno.pontryagin.solve import Solver
-from hno.types import Extremal, Status, join
+from hno.types import Extremal, Field, Points, Status, join
 
 
 def fake_labels(
@@ -87,14 +91,52 @@ def small_architecture(
     )
 
 
+def nothing(points: Points) -> Field:
+    """The field of a value function that is 0 everywhere."""
+    zero = torch.zeros_like(points.theta)
+    return Field(zero, zero, zero[..., None, None] * points.x.unsqueeze(-3))
+
+
+class Controller(Policy):
+    """A policy that stands where an evaluation has a learned one: with its game and a value function."""
+
+    def __init__(self, game: Game, policy: Player, field: Callable[[Points], Field] = nothing) -> None:
+        self.game, self.policy, self.operator = game, as_policy(policy), SimpleNamespace(field=field)
+
+    def act(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
+        return self.policy.act(tau, x, theta)
+
+
+def evaluation_of(
+    game: Game, policy: Player, labels: Sequence[Extremal], field: Callable[[Points], Field] = nothing, **entries: Any
+) -> Evaluation:
+    """The evaluation of any policy from the starts of labels, before its episodes are played.
+
+    Args:
+        game: the game.
+        policy: feedback controls of all players.
+        labels: one set per type, and those of every condition.
+        field: its value function.
+        entries: of the configuration, or fields of the evaluation.
+    """
+    controller: Any = policy if hasattr(policy, "operator") else Controller(game, policy, field)
+    known = {name: entries.pop(name) for name in Evaluation._fields if name in entries}
+    types = [tuple(found.theta[0].tolist()) for found in labels if len(found.theta)]
+    options = {"clearance": 0.02, "dt": 0.02, "seed": 0, **entries}
+    return Evaluation("any", controller, (), types, options, lambda condition: labels, labels)._replace(**known)
+
+
+def evaluated(
+    game: Game, policy: Player, labels: Sequence[Extremal], seen: Sequence[Any] = (), **entries: Any
+) -> Evaluation:
+    """The same with episodes."""
+    disturbance = entries.pop("disturbance", Disturbance())
+    found = evaluation_of(game, policy, labels, seen=seen, **entries)
+    return found._replace(played=play(game, found.policy, labels, found.dt, disturbance))
+
+
 def played_table(
-    game: Game,
-    policy: Player,
-    labels: Sequence[Extremal],
-    seen: Sequence[Sequence[float]],
-    dt: float = 0.02,
-    disturbance: Disturbance = Disturbance(),
-    field: ValueField | None = None,
+    game: Game, policy: Player, labels: Sequence[Extremal], seen: Sequence[Any], **entries: Any
 ) -> list[TypeRow]:
-    """Play from the starts of labels, and what came of it."""
-    return collision_table(game, labels, play(game, policy, labels, dt, disturbance), seen, 0.02, field)
+    """What comes of a policy from the starts of labels."""
+    return collision_table(evaluated(game, policy, labels, seen, **entries))

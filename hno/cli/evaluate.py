@@ -175,7 +175,7 @@ def play_starts(evaluation: Evaluation, labels: Sequence[Extremal], results: Res
     table = CollisionTable().compute(found)
     results.time("evaluation", time.perf_counter() - began)
     if results.content["episodes"] is None:
-        kept = episodes(game, played, labels, found.clearance)
+        kept = episodes(found)
         write_json(folder / EPISODES, kept)
         conditions = {name: found.options[name] for name in ("clearance", "dt", "widen", "noise", "delay")}
         results.update(**conditions, constraint_unit=game.constraint_unit, table=table, episodes=EPISODES)

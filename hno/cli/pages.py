@@ -52,7 +52,7 @@ def _report(settings: ReportSettings, folder: Path) -> None:
     from hno.report.runs import load
 
     if settings.figures:
-        from hno.report.figures import write_figures
+        from hno.report.pictures import write_figures
 
         print(*write_figures(load(folder), Path(settings.to or folder / "figures")), sep="\n")
         return

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
 from torchmetrics.functional import weighted_mean_absolute_percentage_error
 
+from hno.control import Feedback
 from hno.control.rollout import Disturbance, Player, rollout
 from hno.data.rows import rows_of
 from hno.evaluation import format as text
 from hno.evaluation.outcome import Outcome, outcome, pooled
 from hno.evaluation.sections import COUNTS, Column, Evaluation, ModelSection, Type, sections
 from hno.games import Game
-from hno.types import Extremal, Field, Points, Status, Trajectory
-
-ValueField = Callable[[Points], Field]
-"""A value function with its derivatives, such as `ValueOperator.field`."""
+from hno.types import Extremal, Status, Trajectory
 
 
 class TypeRow(NamedTuple):
@@ -54,45 +52,29 @@ def play(
     return [Trajectory(played.t, *part) for part in columns]
 
 
-def collision_table(
-    game: Game,
-    labels: Sequence[Extremal],
-    played: Sequence[Trajectory],
-    seen: Sequence[Sequence[float]],
-    clearance: float,
-    field: ValueField | None = None,
-) -> list[TypeRow]:
-    """What came of the episodes from the starts of labels, type by type.
-
-    Args:
-        game: the game.
-        labels: one set per type.
-        played: episodes from their starts, see `play`.
-        seen: types that the operator was trained with.
-        clearance: what the label must keep for its start to count, in the unit of the game's constraint.
-        field: the policy's value function, if it has one.
-    """
-    known, box, rows = [tuple(map(float, types)) for types in seen], game.type_box, list[TypeRow]()
-    for found, episodes in zip(labels, played, strict=True):
+def collision_table(evaluation: Evaluation) -> list[TypeRow]:
+    """What came of the episodes from the starts of labels, and the errors along these, type by type."""
+    game, box, rows = evaluation.game, evaluation.game.type_box, list[TypeRow]()
+    known = [tuple(map(float, types)) for types in evaluation.seen]
+    for found, played in zip(evaluation.labels, evaluation.played, strict=True):
         theta = tuple(found.theta[0].tolist())
         extrapolated = not bool(box.contains(found.theta[0].to(box.lo)))
         outside = any(not min(c) <= t <= max(c) for t, *c in zip(theta, *known, strict=True)) if known else False
-        errors = label_errors(game, field, found) if field else (None, None)
-        flags = theta in known, extrapolated, outside
-        rows.append(TypeRow(theta, *flags, outcome(game, found, episodes, clearance), *errors))
+        came, errors = outcome(game, found, played, evaluation.clearance), label_errors(evaluation.policy, found)
+        rows.append(TypeRow(theta, theta in known, extrapolated, outside, came, *errors))
     return rows
 
 
-def label_errors(game: Game, field: ValueField, found: Extremal) -> tuple[float | None, float | None]:
+def label_errors(policy: Feedback, found: Extremal) -> tuple[float | None, float | None]:
     """Weighted absolute percentage errors of values and costates at the nodes of converged labels, as in training.
 
     The sum of absolute errors over the sum of absolute labels; None where no label converged.
     """
     if not bool((found.status == Status.CONVERGED).any()):
         return None, None
-    points, labels, _ = rows_of(game, [found])
+    points, labels, _ = rows_of(policy.game, [found])
     assert labels is not None
-    predicted = field(points)
+    predicted = policy.operator.field(points)
     pairs = (predicted.value, labels.value), (predicted.costate, labels.costate)
     value, costate = (float(weighted_mean_absolute_percentage_error(*pair)) for pair in pairs)
     return value, costate
@@ -122,9 +104,7 @@ class CollisionTable(ModelSection):
 
     def compute(self, evaluation: Evaluation) -> list[dict[str, Any]]:
         """One line per type."""
-        seen, clearance, field = evaluation.seen, evaluation.clearance, evaluation.policy.operator.field
-        rows = collision_table(evaluation.game, evaluation.labels, evaluation.played, seen, clearance, field)
-        return [row.content() for row in rows]
+        return [row.content() for row in collision_table(evaluation)]
 
     def rows(self, content: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         """One line per type, with entries that belong together in one column."""

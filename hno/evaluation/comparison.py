@@ -46,17 +46,14 @@ def check_same_game(names: Sequence[str], games: Sequence[Game]) -> None:
     Raises:
         DifferentGamesError: the games differ, by class or by constants.
     """
-    for name, game in zip(names, games, strict=True):
+    constants = [", ".join(f"{name}={value}" for name, value in game.constants.items()) for game in games]
+    pairs = zip(names, games, constants, strict=True)
+    first, *others = [f"{name} plays {type(game).__name__}({values})" for name, game, values in pairs]
+    for game, other in zip(games[1:], others, strict=True):
         if game.fingerprint() != games[0].fingerprint():
-            first, second = (f"{type(g).__name__}({_constants(g)})" for g in (games[0], game))
             raise DifferentGamesError(
-                f"Models of different games have no starts in common: {names[0]} plays {first}, {name} plays {second}. "
-                "Evaluate them one by one."
+                f"Models of different games have no starts in common: {first}, {other}. Evaluate them one by one."
             )
-
-
-def _constants(game: Game) -> str:
-    return ", ".join(f"{name}={value}" for name, value in game.constants.items())
 
 
 def compare(reference: Tensor, other: Tensor) -> Comparison:

@@ -28,11 +28,8 @@ class Condition(NamedTuple):
 
     def entries(self) -> dict[str, Any]:
         """What differs from undisturbed episodes in the game's own start box, by the names of `ENTRIES`."""
-        here, usual = (dict(zip(_STARTS, c.starts, strict=True)) | c.disturbance._asdict() for c in (self, Condition()))
+        here, usual = (condition._asdict() | condition.disturbance._asdict() for condition in (self, Condition()))
         return {entry: here[entry] for entry in ENTRIES if here[entry] != usual[entry]}
-
-
-_STARTS = ("widen", "symmetric")
 
 
 def _amount(value: Any) -> bool:
@@ -95,5 +92,5 @@ def read_condition(game: Game, entries: Mapping[Any, Any], base: Condition, plac
     chosen: dict[str, Any] = {
         name: tuple(value) if isinstance(value, Sequence) else value for name, value in entries.items()
     }
-    own: dict[str, Any] = {name: chosen.pop(name) for name in _STARTS if name in chosen}
+    own: dict[str, Any] = {name: chosen.pop(name) for name in Condition._fields if name in chosen}
     return base._replace(**own, disturbance=base.disturbance._replace(**chosen))

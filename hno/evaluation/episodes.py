@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,6 +10,7 @@ import torch
 from torch import Tensor
 
 from hno.data.certificates import safe
+from hno.evaluation.sections import Evaluation
 from hno.games import Game
 from hno.games.kinematics import separation
 from hno.types import Extremal, Trajectory
@@ -21,23 +21,18 @@ FRAMES = 50
 """An episode is kept at about so many times, and where players are closest."""
 
 
-def episodes(game: Game, played: Sequence[Trajectory], labels: Sequence[Extremal], clearance: float) -> dict[str, Any]:
+def episodes(evaluation: Evaluation) -> dict[str, Any]:
     """The worst and the typical episode of every type, among the starts that count.
-
-    Args:
-        game: the game.
-        played: episodes from the start states of the labels, one set per type.
-        labels: one set per type.
-        clearance: what the label must keep for its start to count, in the unit of the game's constraint.
 
     Returns:
         JSON content: positions of all players over time, the distance below which it is a collision where the
         constraint is one, the path of the equilibrium from the same start, costs. Types without a start that counts
         are left out.
     """
+    game, played = evaluation.game, evaluation.played
     kept = []
-    for found, part in zip(labels, played, strict=True):
-        counted = safe(found, clearance).nonzero().squeeze(-1)
+    for found, part in zip(evaluation.labels, played, strict=True):
+        counted = safe(found, evaluation.clearance).nonzero().squeeze(-1)
         if len(counted):
             near = part.clearance[counted]
             chosen = {"worst": near.argmin(), "typical": near.argsort()[len(near) // 2]}  # NaN is the smallest
@@ -53,6 +48,7 @@ def _episode(game: Game, played: Trajectory, label: Extremal, row: int) -> dict[
     closest = int(violation.nan_to_num(-math.inf).argmax())
     frames = sorted({*range(0, len(played.t), math.ceil(len(played.t) / FRAMES)), closest})
     t, places = played.t[frames], game.positions(played.x[row, frames])
+    apart = separation(places).amin(-1) if game.players > 1 and game.distance_constraints else None
     return {
         "theta": [float(entry) for entry in theta],
         "collided": bool(played.collided[row]),
@@ -62,16 +58,9 @@ def _episode(game: Game, played: Trajectory, label: Extremal, row: int) -> dict[
         "label_cost": _rounded(label.cost[row]),
         "t": _rounded(t),
         "positions": _rounded(places),
-        "radius": _radius(game, places, violation[frames]),
+        "radius": None if apart is None else _rounded(violation[frames] + apart),
         "label_positions": _rounded(_at(t, label.t, game.positions(label.x[row].to(places)))),
     }
-
-
-def _radius(game: Game, places: Tensor, violation: Tensor) -> Any:
-    """Distance of players below which it is a collision at each time, m; None where the constraint is no distance."""
-    if game.players == 1 or not game.distance_constraints:
-        return None
-    return _rounded(violation + separation(places).amin(-1))
 
 
 def _at(times: Tensor, t: Tensor, places: Tensor) -> Tensor:

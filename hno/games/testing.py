@@ -32,7 +32,7 @@ def check_game(game: Game) -> None:
         ContractError: the first promise that the game breaks.
     """
     game = copy.deepcopy(game)
-    for check in (_check_attributes, _check_box_shapes, _check_box_edges, _check_places):
+    for check in (_check_attributes, _check_boxes, _check_places):
         check(game)
     for dtype in (torch.float32, torch.float64):
         for check_dtype in (_check_outputs, _check_derivatives, check_control_box):
@@ -49,7 +49,7 @@ def _check_attributes(game: Game) -> None:
         raise ContractError(f"Expected positive constants; got: {error} Change it.") from error
 
 
-def _check_box_shapes(game: Game) -> None:
+def _check_boxes(game: Game) -> None:
     remedy = "Boxes have one row per entry of `roles`; control_box may be that of one player, if all have the same."
     joint, own = (game.players, game.state_dim), (game.players, game.control_dim)
     controls = own[1:] if game.control_box.lo.dim() == 1 else own
@@ -57,17 +57,12 @@ def _check_box_shapes(game: Game) -> None:
     for name, shape in shapes.items():
         box = getattr(game, name)
         require(box.lo.shape == shape, f"{name} of shape {shape}", tuple(box.lo.shape), remedy)
-        corners = [box.lo.tolist(), box.hi.tolist()]
+        corners, positive = [box.lo.tolist(), box.hi.tolist()], (box.width > 0).all() or name == "initial_box"
         require(box.width.isfinite().all(), f"finite corners of {name}", corners, "State its limits.")
-
-
-def _check_box_edges(game: Game) -> None:
-    for name in ("state_box", "control_box", "type_box"):
-        width = getattr(game, name).width
-        require((width > 0).all(), f"positive edges of {name}", width.tolist(), "They are divided by.")
-    corners = torch.stack([game.initial_box.lo, game.initial_box.hi])
-    inside, remedy = game.state_box.contains(corners).all(), "Widen state_box until every episode starts in it."
-    require(inside, "initial_box inside state_box", corners.tolist(), remedy)
+        require(positive, f"positive edges of {name}", box.width.tolist(), "They are divided by.")
+    start = torch.stack([game.initial_box.lo, game.initial_box.hi])
+    inside, remedy = game.state_box.contains(start).all(), "Widen state_box until every episode starts in it."
+    require(inside, "initial_box inside state_box", start.tolist(), remedy)
 
 
 def _check_places(game: Game) -> None:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import jinja2
+from jinja2.utils import htmlsafe_json_dumps
 from markupsafe import Markup
 
 from hno.data.store import replace_whole
@@ -21,6 +21,7 @@ from hno.report.records import Run
 from hno.report.runs import Sweep
 from hno.report.tables import (
     CACHED,
+    FILTERS,
     Table,
     label_tables,
     mapping_table,
@@ -33,7 +34,6 @@ from hno.report.tables import (
 
 EPISODES = 400
 """Episodes of a page, at most."""
-FILTERS = ("game", "operator", "activation", "seed")
 
 
 def write_page(sweep: Sweep, path: Path, refresh: float | None = None) -> None:
@@ -70,30 +70,20 @@ def render(sweep: Sweep, refresh: float | None = None) -> str:
         curve_games=sorted({entry["game"] for entry in curves}), recipe_table=recipe_table(found),
         run_table=run_table(runs), labels=label_tables(runs), sections=[entry for entry in sections if entry[1]],
         common=common, differing=differing, cached=CACHED, shown=min(len(played), EPISODES), total=len(played),
-        refresh=refresh, themes={name: Markup(_properties(one)) for name, one in vega.THEMES.items()},
+        refresh=refresh, themes=vega.THEMES, font=Markup(vega.FONT),
         vega=Markup(vega.library().replace("</script", "<\\/script").replace("<!--", "<\\!--")), data=embedded(data),
     )  # fmt: skip
 
 
 def embedded(content: Any) -> Markup:
     """JSON that no text inside can leave: nothing in it looks like markup."""
-    found = json.dumps(content, separators=(",", ":"), sort_keys=True, allow_nan=False)
-    for character in "<>&\u2028\u2029":
-        found = found.replace(character, f"\\u{ord(character):04x}")
-    return Markup(found)
-
-
-def _properties(colors: vega.Palette) -> str:
-    """Custom properties of the page's style."""
-    return "".join(f"--{name}:{value};" for name, value in {**colors, "font": vega.FONT}.items())
+    return htmlsafe_json_dumps(content, separators=(",", ":"), sort_keys=True, allow_nan=False)
 
 
 def _cards(found: Sequence[Recipe]) -> list[dict[str, Any]]:
     """Heat maps of recipes, safest first, then of their single runs."""
     ordered = sorted((one for one in found if one.types), key=lambda one: (one.game, one.pooled.rate or 0.0))
-    pooled = [
-        {"recipe": one, "names": names_of(one) | {"level": "recipe"}, "runs": verdicts.seeds(one)} for one in ordered
-    ]
+    pooled = [{"recipe": one, "names": names_of(one) | {"level": "recipe"}, "runs": one.seeds} for one in ordered]
     single = [
         {"recipe": dataclasses.replace(one, runs=(run,)), "names": names_of(run) | {"level": "run"}}
         | {"runs": f"seed {plain(run.seed)}"}
@@ -112,16 +102,12 @@ def _choices(runs: Sequence[Run], name: str) -> list[str]:
 def _settings(runs: Sequence[Run], found: Sequence[Recipe]) -> tuple[dict[str, str | None], Table]:
     """Settings and versions that all runs share, and a table of the others by recipe."""
     said = {run.name: {**run.settings, **{f"version of {p}": v for p, v in run.versions.items()}} for run in runs}
-    values = {
-        key: {one.get(key) for one in said.values()}
-        for key in dict.fromkeys(key for one in said.values() for key in one)
-    }
+    keys = dict.fromkeys(key for one in said.values() for key in one)
+    values = {key: {one.get(key) for one in said.values()} for key in keys}
     differing = [key for key, some in values.items() if len(some) > 1 and key != "seed"]
     rows = [
         {"game": one.game, "recipe": one.name, **{key: said[one.runs[0].name].get(key) for key in differing}}
         for one in found
-        if one.runs
+        if one.runs and differing
     ]
-    return {key: next(iter(some)) for key, some in values.items() if len(some) == 1}, mapping_table(
-        rows if differing else []
-    )
+    return {key: next(iter(some)) for key, some in values.items() if len(some) == 1}, mapping_table(rows)

@@ -6,12 +6,12 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from hno.evaluation.format import interval, percent, signed
+from hno.evaluation.format import at, interval, percent, signed
 from hno.report.episode import Episode, closest, frames, whole
 from hno.report.recipes import Recipe
 from hno.report.records import Run
 from hno.report.tables import Row, names_of
-from hno.report.verdicts import at, clearance, seeds, share
+from hno.report.verdicts import clearance, share
 
 POINTS = 120
 """Points of a learning curve, at most."""
@@ -41,7 +41,7 @@ def comparison(recipes: Iterable[Recipe]) -> list[Row]:
 
 def _rates(recipe: Recipe) -> list[Row]:
     whole, (low, high) = recipe.pooled, recipe.pooled.interval or (None, None)
-    tip = f"{recipe.name}, {seeds(recipe)}\n{share(whole)}\n95 % interval {interval(whole.interval)}"
+    tip = f"{recipe.name}, {recipe.seeds}\n{share(whole)}\n95 % interval {interval(whole.interval)}"
     count = f"{whole.collisions:,} of {whole.safe_starts:,}"
     rows: list[Row] = [{"seed": None, "rate": whole.rate, "low": low, "high": high, "count": count, "tip": tip}]
     for run, own in zip(recipe.runs, recipe.by_seed, strict=True):
@@ -72,9 +72,9 @@ def ranked(runs: Iterable[Run]) -> list[tuple[Run, Episode]]:
     """Every episode: the worst of every run first, then a typical one of every run, then by clearance."""
     ordered = []
     for run in runs:
+        places = {"worst": 0, "typical": 1}
         own = sorted(run.episodes, key=lambda one: one.order)
-        first = [next((one for one in own if one.kind == kind), None) for kind in ("worst", "typical")]
-        ordered += [(next((k for k, e in enumerate(first) if e is one), 2), one.order, run, one) for one in own]
+        ordered += [(places.pop(one.kind, 2), one.order, run, one) for one in own]
     return [(run, one) for *_, run, one in sorted(ordered, key=lambda entry: entry[:2])]
 
 

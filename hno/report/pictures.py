@@ -1,9 +1,13 @@
-"""Pictures of runs and recipes: for a run's folder, for dashboards and for documents."""
+"""Pictures of runs, for their folders and dashboards; figures of recipes and a summary in Markdown, for documents."""
 
 from __future__ import annotations
 
+import functools
 import io
+import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,17 +15,25 @@ import altair as alt
 from PIL import Image
 
 from hno.data.store import replace_whole
+from hno.evaluation.format import NOT_AVAILABLE, at, significant
 from hno.evaluation.outcome import pooled
+from hno.evaluation.sections import plain
+from hno.evaluation.spectrum import Ratio, condition_ratios
 from hno.report import charts, vega
 from hno.report.charts import encounter, separation
 from hno.report.episode import Episode, closest, distances, frames, whole
-from hno.report.recipes import by_type
-from hno.report.records import type_row
-from hno.report.verdicts import share
+from hno.report.page_data import comparison, ranked
+from hno.report.recipes import Recipe, best, by_type, headline, recipes
+from hno.report.records import Run, type_row
+from hno.report.runs import Sweep
+from hno.report.tables import CACHED, Table, mapping_table, recipe_table
+from hno.report.verdicts import clearance, jobs, share, verdict, why
 
 WIDE, HIGH = 420, 170
 """Size of a view of an encounter, px."""
 LEGEND = alt.Legend(title="rate", format=".1%", values=[0.001, 0.01, 0.1, 1], gradientLength=120)
+REFERENCE = "tanh"
+"""The activation whose condition numbers are divided by those of the others."""
 
 
 def rates(types: Sequence[Mapping[str, Any]], title: str, number: int = 0) -> vega.Layers:
@@ -69,3 +81,94 @@ def rollout_picture(found: Episode, path: Path, title: str) -> None:
         picture.paste(image, (picture.width - image.width, top))
         top += image.height
     replace_whole(path, lambda draft: picture.save(draft, format="PNG"))
+
+
+def write_figures(sweep: Sweep, folder: Path) -> list[Path]:
+    """Write charts of every game, each as SVG and as PNG, and `summary.md` into a folder, and return the files."""
+    found = recipes(sweep.runs)
+    content = {"summary.md": markdown(sweep, found).encode()}
+    for game in sorted({recipe.game for recipe in found}):
+        for name, chart in _charts(game, [recipe for recipe in found if recipe.game == game]).items():
+            content |= {f"{name}.svg": vega.svg(chart).encode(), f"{name}.png": vega.png(chart)}
+    for name, data in content.items():
+        replace_whole(folder / name, functools.partial(Path.write_bytes, data=data))
+    return [folder / name for name in content]
+
+
+def _charts(game: str, found: Sequence[Recipe]) -> dict[str, alt.TopLevelMixin]:
+    """Charts of a game: heat maps and rates of all recipes, and encounters of the best one."""
+    shown = [recipe for recipe in found if recipe.types and all(len(one["theta"]) == 2 for one in recipe.types)]
+    maps = [rates(recipe.types, recipe.name, number) for number, recipe in enumerate(shown)]
+    drawn: dict[str, alt.TopLevelMixin] = {}
+    if maps:
+        title = f"{game}: collisions of safe starts in %; framed: types with training labels"
+        drawn[f"collisions_{game}"] = alt.concat(*maps, columns=math.isqrt(len(maps) - 1) + 1, spacing=30, title=title)
+    if rows := comparison(found):
+        drawn[f"comparison_{game}"] = charts.comparison(vega.inline(rows)).properties(width=WIDE)
+    chosen = headline(recipe for recipe in best(found) if any(run.episodes for run in recipe.runs))
+    return drawn | (_encounters(chosen) if chosen else {})
+
+
+def _encounters(recipe: Recipe) -> dict[str, alt.TopLevelMixin]:
+    """The worst and a typical episode at their closest approach, by kind and view."""
+    found: dict[str, alt.TopLevelMixin] = {}
+    ordered = sorted((one for _, one in ranked(recipe.runs)), key=lambda one: one.order)
+    for kind in ("worst", "typical"):
+        if own := [one for one in ordered if one.kind == kind]:
+            one = own[0] if kind == "worst" else own[len(own) // 2]
+            near = clearance(one, recipe.runs[0].constraint_unit)
+            drawn = views(one, closest(one), True, f"{recipe.name}, types {at(one.theta)}, {kind}: {near}")
+            found |= {f"encounter_{recipe.game}_{kind}_{view}": chart for view, chart in drawn.items()}
+    return found
+
+
+def markdown(sweep: Sweep, found: Sequence[Recipe]) -> str:
+    """Verdicts and tables."""
+    blocks = [f"# {sweep.name}", jobs(sweep)]
+    blocks += [f"- **{one.game}**, {one.name}, {share(one.pooled)}. {verdict(one, found)}" for one in best(found)]
+    blocks += ["## Recipes", table_text(recipe_table(found)), CACHED]
+    ratios = ratio_table(sweep.runs)
+    blocks += ["## Ratios of condition numbers of the tangent kernel", table_text(ratios)] if ratios.rows else []
+    missing = [f"- {run.name}: {_plain(why(run))}" for run in sweep.runs if not run.finished]
+    blocks += ["## Without a result", "\n".join(missing)] if missing else []
+    blocks += ["## How to repeat it", f"```\n{sweep.command}\n```"] if sweep.command else []
+    return "\n\n".join(blocks) + "\n"
+
+
+def table_text(table: Table) -> str:
+    """A table in Markdown."""
+    lines = [[column.title for column in table.columns], ["---"] * len(table.columns), *table.texts]
+    return "\n".join(f"| {' | '.join(_plain(text) for text in line)} |" for line in lines)
+
+
+def _plain(text: str) -> str:
+    return " ".join(text.split()).replace("|", "\\|").replace("<", "&lt;")
+
+
+def ratio_table(runs: Sequence[Run]) -> Table:
+    """Condition numbers of an activation over those of the others (the paper's table of activations), by type.
+
+    Only runs of one game, operator and seed are compared; several of one activation are told apart by their names.
+    """
+    groups: dict[tuple[str, str, str], list[Run]] = {}
+    for run in runs:
+        if run.finished and run.entries.get("ntk"):
+            groups.setdefault((run.game, run.operator, plain(run.seed)), []).append(run)
+    rows = list[dict[str, Any]]()
+    for key, same in sorted(groups.items()):
+        known, counts = (
+            dict(zip(("game", "operator", "seed"), key, strict=True)),
+            Counter(run.activation for run in same),
+        )
+        names = [run.activation + f" ({run.name})" * (counts[run.activation] > 1) for run in same]
+        sections = {name: run.entries["ntk"] for name, run in zip(names, same, strict=True)}
+        with suppress(LookupError, TypeError, ValueError):  # nothing to compare, other points, or a damaged section
+            for one in condition_ratios(sections, REFERENCE):
+                for kind, name in (("kernel", "J J'"), ("product", "trunk times branch")):
+                    ratios = {f"{REFERENCE} / {other}": _ratio(ratio) for other, ratio in one[kind].items()}
+                    rows.append({**known, "types": at(one["theta"]), "kernel": name, **ratios})
+    return mapping_table(rows)
+
+
+def _ratio(found: Ratio) -> str:
+    return NOT_AVAILABLE if found.value is None else f"{found.bound} {significant(found.value)}".removeprefix("= ")

@@ -11,10 +11,9 @@ from typing import Any, NamedTuple
 
 from scipy.stats import t as student
 
-from hno.evaluation.closed_loop import TypeRow
-from hno.evaluation.format import NOT_AVAILABLE
+from hno.evaluation.format import NOT_AVAILABLE, counted
 from hno.evaluation.outcome import Pooled, pooled
-from hno.report.records import Run
+from hno.report.records import Row, Run
 
 IGNORED = ("seed", "resume", "cache", "workers", "data.cache", "data.workers", "trainer.print_every", "trainer.threads")
 """Settings that do not make another recipe."""
@@ -47,23 +46,18 @@ def spread(values: Iterable[float | None]) -> Spread | None:
     return Spread(mean, bounds, min(found), max(found), count)
 
 
-def pool(rows: Iterable[TypeRow]) -> Pooled:
-    """Rows of one or several tables in one line."""
-    return pooled([row.content() for row in rows])
-
-
-def by_type(rows: Iterable[TypeRow]) -> list[dict[str, Any]]:
+def by_type(rows: Iterable[Row]) -> list[dict[str, Any]]:
     """Rows of one or several tables as one line per type.
 
     Returns:
         "theta", "seen" and "extrapolated" as in `TypeRow`, and the entries of `Pooled` over seeds.
     """
-    groups: dict[tuple[float, ...], list[TypeRow]] = {}
+    groups: dict[tuple[float, ...], list[Row]] = {}
     for row in rows:
-        groups.setdefault(row.theta, []).append(row)
+        groups.setdefault(row["theta"], []).append(row)
     return [
-        {"theta": theta, **{flag: any(getattr(row, flag) for row in same) for flag in ("seen", "extrapolated")}}
-        | pool(same)._asdict()
+        {"theta": theta, **{flag: any(row[flag] for row in same) for flag in ("seen", "extrapolated")}}
+        | pooled(same)._asdict()
         for theta, same in sorted(groups.items())
     ]
 
@@ -90,9 +84,14 @@ class Recipe:
         return " / ".join(filter(None, (self.operator, self.activation, self.variant)))
 
     @property
+    def seeds(self) -> str:
+        """How many seeds count, in words."""
+        return counted(len(self.runs), "seed")
+
+    @property
     def special(self) -> str:
-        """Changed constants of the game and how episodes were played, as far as that is not usual."""
-        return ", ".join(sorted({text for run in self.runs for text in (_constants(run), run.conditions)} - {""}))
+        """Conditions of its runs."""
+        return ", ".join(sorted({run.conditions for run in self.runs} - {""}))
 
     @property
     def conditions(self) -> str:
@@ -104,7 +103,7 @@ class Recipe:
     @property
     def comparable(self) -> Comparable:
         """Equal for recipes whose numbers may be compared."""
-        return self.game, self.special, frozenset(row.theta for run in self.runs for row in run.table)
+        return self.game, self.special, frozenset(row["theta"] for run in self.runs for row in run.table)
 
     @functools.cached_property
     def types(self) -> list[dict[str, Any]]:
@@ -114,7 +113,7 @@ class Recipe:
     @functools.cached_property
     def by_seed(self) -> list[Pooled]:
         """One line per run, over all types."""
-        return [pool(run.table) for run in self.runs]
+        return [pooled(run.table) for run in self.runs]
 
     @functools.cached_property
     def pooled(self) -> Pooled:
@@ -170,11 +169,6 @@ def _recipe(names: tuple[str, str, str], variant: str, runs: Sequence[Run]) -> R
     repeated = tuple(run for run in finished if all(run is not other for other in counted))
     failed = sum(run.status == "failed" for run in runs)
     return Recipe(*names, variant, counted, repeated, len(runs) - len(finished) - failed, failed)
-
-
-def _constants(run: Run) -> str:
-    prefix = "game.constants."
-    return ", ".join(f"{key[len(prefix) :]} {text}" for key, text in sorted(run.settings.items()) if prefix in key)
 
 
 def best(found: Iterable[Recipe]) -> list[Recipe]:

@@ -16,6 +16,10 @@ from hno.report.episode import Episode
 
 Curves = dict[str, list[tuple[int, float]]]
 """Metric -> step and value."""
+Row = Mapping[str, Any]
+"""A row of the collision table: the entries of `TypeRow` and its `Outcome`."""
+CONSTANTS = "game.constants."
+"""What settings that are constants of a game begin with."""
 PLAY = ("clearance", "dt", "widen", "noise", "delay")
 """Fields of `Run` that say how episodes were played; their defaults go without saying."""
 
@@ -46,7 +50,7 @@ class Run(BaseModel):
     noise: float = 0
     delay: int = 0
     test_seed: int | None = None
-    table: SkipValidation[list[TypeRow]]
+    table: SkipValidation[list[Row]]
     """One row for every type."""
 
     name: str = ""
@@ -67,9 +71,12 @@ class Run(BaseModel):
 
     @property
     def conditions(self) -> str:
-        """How episodes were played, as far as that is special: equal for runs that may be compared."""
-        found = {name: (getattr(self, name), type(self).model_fields[name].default) for name in PLAY}
-        return ", ".join(f"{name} {value:g}" for name, (value, usual) in found.items() if value != usual)
+        """Changed constants of the game and how episodes were played, as far as that is not usual."""
+        constants = {key.removeprefix(CONSTANTS): text for key, text in self.settings.items() if CONSTANTS in key}
+        usual = type(self).model_fields
+        play = {name: getattr(self, name) for name in PLAY if getattr(self, name) != usual[name].default}
+        said = [f"{name} {text}" for name, text in sorted(constants.items())]
+        return ", ".join(said + [f"{name} {value:g}" for name, value in play.items()])
 
     @property
     def entries(self) -> Mapping[str, Any]:
@@ -84,7 +91,7 @@ class Run(BaseModel):
 _ROW = TypeAdapter(TypeRow, config=ConfigDict(strict=True, allow_inf_nan=False))
 
 
-def type_row(content: Any) -> TypeRow:
+def type_row(content: Any) -> Row:
     """A row of the collision table from its entry of results.json.
 
     Raises:
@@ -97,7 +104,7 @@ def type_row(content: Any) -> TypeRow:
     row = _ROW.validate_json(json.dumps(nested))
     if not 0 <= row.outcome.collisions <= row.outcome.safe_starts:
         raise ValueError(f"{row.outcome.collisions} collisions of {row.outcome.safe_starts} safe starts")
-    return row
+    return row.content()
 
 
 def sentence(error: Exception) -> str:

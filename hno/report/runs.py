@@ -7,7 +7,7 @@ import json
 import math
 import shlex
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -18,10 +18,6 @@ from hno.report.records import Curves, Run, sentence, type_row
 
 T = TypeVar("T")
 RESULTS, METRICS = "results.json", "csv/metrics.csv"
-
-
-class UnreadableError(ValueError):
-    """A file that is not what it should be; the message says what is wrong with it."""
 
 
 class NoRunsError(ValueError):
@@ -60,7 +56,7 @@ def load(root: Path) -> Sweep:
         name = root.resolve().name if folder == root else folder.relative_to(root).as_posix()
         try:
             runs += _runs(folder, name)
-        except UnreadableError as error:
+        except ValueError as error:
             skipped.append(Skipped(name, str(error)))
     if not runs:
         found = "; ".join(f"{entry.name}: {entry.reason}" for entry in skipped[:3]) or f"no {RESULTS} in it or below"
@@ -83,10 +79,10 @@ def _runs(folder: Path, name: str) -> list[Run]:
     """The run of a folder, or one for each model of an evaluation.
 
     Raises:
-        UnreadableError: it has no results, or foreign ones.
+        ValueError: it has no results, or foreign ones.
     """
     if not (folder / RESULTS).exists():
-        raise UnreadableError(f"no {RESULTS}: the job has only begun, or ended before it could write any")
+        raise ValueError(f"no {RESULTS}: the job has only begun, or ended before it could write any")
     content = _json(folder / RESULTS)
     models = content.pop("models", None) or [{}]
     shared = {key: value for key, value in content.items() if key not in ("episodes", "comparison")}
@@ -101,11 +97,11 @@ def _json(path: Path) -> dict[str, Any]:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise UnreadableError(f"{path.name} cannot be read ({error.strerror})") from error
+        raise ValueError(f"{path.name} cannot be read ({error.strerror})") from error
     except (ValueError, RecursionError) as error:
-        raise UnreadableError(f"{path.name} is not JSON ({error})") from error
+        raise ValueError(f"{path.name} is not JSON ({error})") from error
     if not isinstance(content, dict):
-        raise UnreadableError(f"{path.name} is not hno's: expected an object, got a {type(content).__name__}")
+        raise ValueError(f"{path.name} is not hno's: expected an object, got a {type(content).__name__}")
     return content
 
 
@@ -114,9 +110,11 @@ def _run(folder: Path, name: str, content: Mapping[str, Any]) -> Run:
     try:
         run = Run.model_validate({**content, "episodes": []})
     except ValueError as error:
-        raise UnreadableError(f"{RESULTS} is not hno's: {sentence(error)}") from error
+        raise ValueError(f"{RESULTS} is not hno's: {sentence(error)}") from error
     notes, metrics, episodes = list[str](), folder / METRICS, content.get("episodes")
-    found: dict[str, Any] = {"name": name, "notes": notes, "settings": _settings(run)}
+    found: dict[str, Any] = {"name": name, "notes": notes, "settings": _flat(run.config or {})}
+    if "checkpoint" in found["settings"]:
+        found["settings"]["checkpoint"] = str(run.checkpoint)
     found["command"] = _command(folder / ".hydra" / "hydra.yaml")
     found["table"] = _each(run.table, type_row, "row of the table", notes)
     with _noted(notes, "no learning curves"):
@@ -153,25 +151,12 @@ def _curves(path: Path) -> Curves:
     found: Curves = {}
     with path.open(encoding="utf-8", newline="") as file:
         for line in csv.DictReader(file, restkey="epoch"):
-            step = _decimal(line.get("step"))
-            values = {name: _decimal(text) for name, text in line.items() if name not in ("step", "epoch")}
-            for name, value in values.items():
-                if step is not None and value is not None:
-                    found.setdefault(name, []).append((int(step), value))
+            for name in line.keys() - {"step", "epoch"}:
+                with suppress(ValueError, TypeError):
+                    step, value = int(line["step"]), float(line[name])
+                    if math.isfinite(value):
+                        found.setdefault(name, []).append((step, value))
     return found
-
-
-def _decimal(text: str | None) -> float | None:
-    try:
-        value = float(text or "nan")
-    except ValueError:
-        return None
-    return value if math.isfinite(value) else None
-
-
-def _settings(run: Run) -> dict[str, str]:
-    found = _flat(run.config or {})
-    return found | ({"checkpoint": str(run.checkpoint)} if "checkpoint" in found else {})
 
 
 def _flat(value: Any, prefix: str = "") -> dict[str, str]:

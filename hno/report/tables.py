@@ -6,12 +6,12 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from hno.evaluation.format import NOT_AVAILABLE, interval, number, percent, signed, whole
-from hno.evaluation.outcome import Pooled
-from hno.evaluation.sections import Column, plain, sections
-from hno.report.recipes import Recipe, Spread, best, pool
+from hno.evaluation.format import NOT_AVAILABLE, at, number, percent, signed, whole
+from hno.evaluation.outcome import Pooled, pooled
+from hno.evaluation.sections import COUNTS, Column, plain, sections
+from hno.report.recipes import Recipe, Spread, best
 from hno.report.records import Run
-from hno.report.verdicts import at, over_seeds
+from hno.report.verdicts import over_seeds
 
 Row = Mapping[str, Any]
 """Values by the names of columns; the page also uses "game" and what else it filters by, and "mark"."""
@@ -64,13 +64,9 @@ def _range(found: Spread | None) -> str:
     return NOT_AVAILABLE if found is None else f"{percent(found.low)} to {percent(found.high)}"
 
 
+FILTERS = ("game", "operator", "activation", "seed")
+"""What the page is filtered by."""
 CACHED = "Labels that were cached took no time, and the total is then without them."
-COUNTS = (
-    Column("safe_starts", "safe starts", format=whole),
-    Column("collisions", "collisions", format=whole),
-    Column("rate", "rate", format=percent),
-    Column("interval", "95 % interval", format=interval),
-)
 RECIPE = (
     Column("game", "game"), Column("name", "recipe"), Column("seeds", "seeds", format=whole), *COUNTS,
     Column("rates", "range over seeds", format=_range), Column("worst", "worst type", format=_worst),
@@ -96,9 +92,7 @@ def _counts(found: Pooled) -> dict[str, Any]:
 
 def names_of(entry: Run | Recipe) -> dict[str, Any]:
     """What an entry of the page is filtered by."""
-    return {
-        key: plain(getattr(entry, key)) for key in ("game", "operator", "activation", "seed") if hasattr(entry, key)
-    }
+    return {key: plain(getattr(entry, key)) for key in FILTERS if hasattr(entry, key)}
 
 
 def recipe_table(found: Sequence[Recipe]) -> Table:
@@ -107,8 +101,8 @@ def recipe_table(found: Sequence[Recipe]) -> Table:
     for one in found:
         known = {name: getattr(one, name) for name in ("name", "unfinished", "failed", "rates", "excess")}
         known |= {stage: one.seconds(stage) for stage in ("labels", "training", "total")}
-        mark = "best" if any(one is other for other in chosen) else ""
-        rows.append({**names_of(one), **_counts(one.pooled), **known, "seeds": len(one.runs), "mark": mark})
+        known |= {"seeds": len(one.runs), "mark": "best" if one in chosen else ""}
+        rows.append({**names_of(one), **_counts(one.pooled), **known})
     return Table(RECIPE, rows)
 
 
@@ -119,7 +113,7 @@ def run_table(runs: Sequence[Run]) -> Table:
         known = {name: getattr(run, name) for name in ("name", "status", "steps")} | {"total": run.spent("total")}
         errors = {f"{name}_error": run.metrics.get(f"val/{name}_error") for name in ("value", "costate")}
         mark = "" if run.finished else ("failed" if run.status == "failed" else "unfinished")
-        rows.append({**names_of(run), **_counts(pool(run.table)), **known, **errors, "mark": mark})
+        rows.append({**names_of(run), **_counts(pooled(run.table)), **known, **errors, "mark": mark})
     return Table(RUN, rows)
 
 

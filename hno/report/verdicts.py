@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from hno.evaluation.format import NOT_AVAILABLE, counted, interval, percent, signed, types
+from hno.evaluation.format import NOT_AVAILABLE, at, counted, interval, percent, signed
 from hno.evaluation.outcome import Pooled
 from hno.report.episode import Episode
 from hno.report.recipes import Recipe, Spread, rivals
@@ -15,11 +15,6 @@ from hno.report.runs import Sweep
 def share(found: Pooled) -> str:
     """Collisions of starts, in short."""
     return f"{found.collisions:,} of {found.safe_starts:,}: {percent(found.rate)}"
-
-
-def at(theta: Sequence[float]) -> str:
-    """Player types."""
-    return f"({types(theta)})"
 
 
 def clearance(found: Episode, unit: str) -> str:
@@ -39,11 +34,6 @@ def over_seeds(found: Spread | None) -> str:
         return f"{signed(found.mean)} (one seed)"
     low, high = found.interval
     return f"{signed(found.mean)} ({signed(low)} to {signed(high)}, {found.seeds} seeds)"
-
-
-def seeds(recipe: Recipe) -> str:
-    """How many seeds count."""
-    return counted(len(recipe.runs), "seed")
 
 
 def jobs(sweep: Sweep) -> str:
@@ -73,7 +63,7 @@ def verdict(recipe: Recipe, recipes: Sequence[Recipe]) -> str:
     names = ", ".join(others[:3]) + (f" and {len(others) - 3} more" if len(others) > 3 else "")
     rest = f" Not told apart from {names}: the intervals overlap." if others else ""
     return (
-        f"{judged} ({seeds(recipe)}, {recipe.conditions}): 95 % interval {interval(whole.interval)}.{told} "
+        f"{judged} ({recipe.seeds}, {recipe.conditions}): 95 % interval {interval(whole.interval)}.{told} "
         f"Joint cost above the equilibrium's: {over_seeds(recipe.excess)}.{rest}"
     )
 

@@ -6,13 +6,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from hno.evaluation.closed_loop import play
 from hno.evaluation.episodes import FRAMES, episodes
 from hno.evaluation.outcome import outcome
 from hno.games import make
 from hno.games.kinematics import separation
 from hno.types import Extremal
-from tests.fakes import fake_labels
+from tests.fakes import evaluated, fake_labels
 from tests.lq import LinearQuadratic
 from tests.walkers import Walkers
 
@@ -40,7 +39,7 @@ def sets() -> list[Extremal]:
 def test_the_worst_and_the_typical_start_that_count_are_kept(sets: list[Extremal]) -> None:
     """Distances are 1.8, 0.8, 0.1, 1.0 and 1.6, 0.7, 1.4; the radius of a type is 0.2 + 0.2 theta."""
     game = Walkers()
-    kept = episodes(game, play(game, straight, sets, 0.02), sets, 0.02)
+    kept = episodes(evaluated(game, straight, sets))
     assert (kept["players"], kept["dimensions"]) == (2, 2)
     found = [(e["theta"][0], e["kind"], e["distance"], e["collided"]) for e in kept["episodes"]]
     assert found == [
@@ -54,8 +53,8 @@ def test_the_worst_and_the_typical_start_that_count_are_kept(sets: list[Extremal
 
 def test_an_episode_shows_where_players_go_and_where_the_equilibrium_goes(sets: list[Extremal]) -> None:
     game = Walkers()
-    played = play(game, straight, sets, 0.02)
-    episode = episodes(game, played, sets, 0.02)["episodes"][0]
+    evaluation = evaluated(game, straight, sets)
+    played, episode = evaluation.played, episodes(evaluation)["episodes"][0]
     frames = len(episode["t"])
     assert FRAMES / 2 < frames <= FRAMES + 2
     kept = separation(torch.tensor(episode["positions"])).amin(-1)
@@ -75,9 +74,9 @@ def test_an_episode_shows_where_players_go_and_where_the_equilibrium_goes(sets: 
 
 def test_a_broken_episode_is_the_worst(sets: list[Extremal]) -> None:
     """What is not finite counts as a collision, and stays readable JSON once the writer has replaced it."""
-    played = play(Walkers(), straight, sets, 0.02)
-    played[0].clearance[1] = torch.nan
-    worst = episodes(Walkers(), played, sets, 0.02)["episodes"][0]
+    evaluation = evaluated(Walkers(), straight, sets)
+    evaluation.played[0].clearance[1] = torch.nan
+    worst = episodes(evaluation)["episodes"][0]
     assert (worst["kind"], worst["collided"]) == ("worst", True)
     assert worst["distance"] == pytest.approx(1.8, abs=2e-3)
 
@@ -90,7 +89,7 @@ def test_three_dimensions_and_the_size_of_the_file() -> None:
     def hover(tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
         return torch.tensor([0.0, 0.0, 9.81]).expand(len(x), 2, 3)
 
-    kept = episodes(game, play(game, hover, found, 0.02), found, 0.02)
+    kept = episodes(evaluated(game, hover, found))
     assert kept["dimensions"] == 3
     assert len(json.dumps(kept)) / len(kept["episodes"]) < 8000
 
@@ -99,8 +98,9 @@ def test_one_player_alone_has_episodes_without_a_radius() -> None:
     a, b, r, q, s = (torch.full((1, 1, 1), c) for c in (0.4, 1.3, 0.7, 0.1, 0.9))
     game = LinearQuadratic(a, b, r[..., 0], q, s)
     found = [fake_labels(game, (0.5,), 3)]
-    played = play(game, lambda tau, x, theta: torch.zeros(len(x), 1, 1), found, 0.1)
-    kept = episodes(game, [episode._replace(clearance=torch.ones(3)) for episode in played], found, 0.02)
+    evaluation = evaluated(game, lambda tau, x, theta: torch.zeros(len(x), 1, 1), found, dt=0.1)
+    played = [episode._replace(clearance=torch.ones(3)) for episode in evaluation.played]
+    kept = episodes(evaluation._replace(played=played))
     assert [episode["kind"] for episode in kept["episodes"]] == ["worst", "typical"]
     assert kept["players"] == 1
     assert all(episode["radius"] is None for episode in kept["episodes"])
@@ -110,6 +110,6 @@ def test_one_player_alone_has_episodes_without_a_radius() -> None:
 def test_where_the_constraint_is_no_distance_there_is_no_radius(sets: list[Extremal]) -> None:
     game = Walkers()
     game.constraint_unit, game.distance_constraints = "", False
-    kept = episodes(game, play(game, straight, sets, 0.02), sets, 0.02)
+    kept = episodes(evaluated(game, straight, sets))
     assert kept["constraint_unit"] == ""
     assert all(episode["radius"] is None for episode in kept["episodes"])

@@ -8,12 +8,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from hno.control.rollout import Disturbance
-from hno.evaluation.latency import latency
-from hno.evaluation.online import compare, safe_starts
+from hno.evaluation.online import compare, latency, safe_starts
 from hno.pontryagin import solve
 from hno.types import Extremal, Status
-from tests.fakes import fake_labels
+from tests.fakes import evaluation_of, fake_labels
 from tests.walkers import Walkers
 
 
@@ -42,7 +40,8 @@ def test_both_controllers_play_the_same_starts_and_the_solver_avoids_the_other()
     types = [(0.0, 0.0), (2.0, 1.0), (4.0, 4.0)]
     labels = [solved(*types[0], count=1), solved(*types[1]), solved(*types[2], count=1)]
     labels[2] = safe_starts(labels[2:], 0, 0.02)[0]
-    rows = compare(Walkers(), straight, labels, types, interval=2, dt=0.1, disturbance=Disturbance(0.01, 0, 1))
+    evaluation = evaluation_of(Walkers(), straight, labels, types=types, dt=0.1, noise=0.01, seed=1)
+    rows = compare(evaluation, labels, interval=2)
     assert [row["theta"] for row in rows] == [*types, None]
     learned, online, solves = ([row[name] for row in rows] for name in ("policy", "solver", "solves"))
     assert [row["safe_starts"] for row in learned] == [row["safe_starts"] for row in online] == [1, 2, 0, 3]

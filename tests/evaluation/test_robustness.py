@@ -11,14 +11,12 @@ from rich.console import Console
 from torch import Tensor
 
 from hno.cli.sections import show_section
-from hno.control import Policy
 from hno.control.rollout import Disturbance
 from hno.evaluation.conditions import Condition, read_conditions
 from hno.evaluation.robustness import Robustness
-from hno.evaluation.sections import Evaluation
 from hno.games import make
 from hno.types import Extremal
-from tests.fakes import fake_labels, played_table
+from tests.fakes import evaluation_of, fake_labels, played_table
 from tests.walkers import Walkers
 
 
@@ -32,29 +30,16 @@ def straight(tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
     return torch.tensor([4.0, 0.0]).expand(len(x), 2, 2)
 
 
-class StraightWalkers(Policy):
-    """As `straight`, with its game."""
-
-    game = Walkers()
-
-    def act(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
-        return straight(tau, x, theta)
-
-
-def rows_of(
-    labels: Sequence[Extremal], conditions: Mapping[str, Any], dt: float = 0.02, types: Sequence[Any] = ((1.0, 1.0),)
-) -> list[dict[str, Any]]:
+def rows_of(labels: Sequence[Extremal], conditions: Mapping[str, Any], dt: float = 0.02) -> list[dict[str, Any]]:
     """Lines of the section for walkers who go straight, from the same labels under every condition."""
-    options = {"conditions": conditions, "clearance": 0.02, "dt": dt, "seed": 1}
-    walkers: Any = StraightWalkers()
-    return Robustness().compute(Evaluation("any", walkers, [], types, options, lambda condition: labels))
+    return Robustness().compute(evaluation_of(Walkers(), straight, labels, conditions=conditions, dt=dt))
 
 
 SETS = [labelled([0.9, 0.05, 0.8]), labelled([0.9, 0.7], theta=2.0)]
 
 
 def test_the_undisturbed_line_repeats_the_played_table() -> None:
-    (row,) = rows_of(SETS, {"nothing": {}}, types=[(1.0, 1.0), (2.0, 2.0)])
+    (row,) = rows_of(SETS, {"nothing": {}})
     table = played_table(Walkers(), straight, SETS, [])
     assert (row["safe_starts"], row["collisions"], row["rate"]) == (5, 1, 0.2)
     assert row["types"] == [
@@ -74,9 +59,8 @@ def test_every_condition_plays_the_labels_of_its_width_and_its_own_disturbance()
         return [labelled([0.9] * (3 if condition.widen == 1 else 4))]
 
     conditions = {"plain": {}, "wide": {"widen": 2.0}, "pushed": {"drift": 0.4}}
-    options = {"conditions": conditions, "clearance": 0.02, "dt": 0.1, "seed": 1}
-    walkers: Any = StraightWalkers()
-    plain, wide, pushed = Robustness().compute(Evaluation("any", walkers, [], [(1.0, 1.0)], options, labels_of))
+    evaluation = evaluation_of(Walkers(), straight, [labelled([0.9])], conditions=conditions, dt=0.1, solve=labels_of)
+    plain, wide, pushed = Robustness().compute(evaluation)
     assert asked == [1.0, 2.0, 1.0]
     assert (plain["safe_starts"], wide["safe_starts"], pushed["safe_starts"]) == (3, 4, 3)
     assert [row["condition"] for row in (plain, wide, pushed)] == [{}, {"widen": 2.0}, {"drift": 0.4}]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hno.report import charts, vega
-from hno.report.figures import markdown, ratio_table, write_figures
+from hno.report.pictures import markdown, ratio_table, write_figures
 from hno.report.recipes import by_type, recipes
 from hno.report.records import type_row
 from hno.report.runs import load

@@ -12,10 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import beta, t
 
-from hno.evaluation.closed_loop import TypeRow
+from hno.evaluation.outcome import pooled
 from hno.report.page_data import cells
-from hno.report.recipes import Recipe, best, by_type, headline, pool, recipes, rivals, spread
-from hno.report.records import Run, type_row
+from hno.report.recipes import Recipe, best, by_type, headline, recipes, rivals, spread
+from hno.report.records import Row, Run, type_row
 from hno.report.runs import load
 from hno.report.tables import recipe_table
 from tests.report.folders import make_results, row, write_run
@@ -23,7 +23,7 @@ from tests.report.folders import make_results, row, write_run
 FIRST, SECOND = (1.0, 1.0), (5.0, 5.0)
 
 
-def result(theta: tuple[float, ...], collisions: int, starts: int, excess_cost: float | None = None) -> TypeRow:
+def result(theta: tuple[float, ...], collisions: int, starts: int, excess_cost: float | None = None) -> Row:
     return type_row(row(theta, collisions, starts) | {"median_excess_cost": excess_cost, "median_label_cost": 10.0})
 
 
@@ -83,13 +83,13 @@ def test_where_nothing_collided_no_type_is_the_worst(tmp_path, counts, shown):
 
 
 def test_counts_are_pooled_and_other_numbers_averaged():
-    (pooled,) = by_type([result(FIRST, 1, 100, 2.0), result(FIRST, 4, 50, None), result(FIRST, 0, 50, 4.0)])
-    assert (pooled["collisions"], pooled["safe_starts"], pooled["relative_excess"]) == (5, 200, pytest.approx(0.3))
+    (found,) = by_type([result(FIRST, 1, 100, 2.0), result(FIRST, 4, 50, None), result(FIRST, 0, 50, 4.0)])
+    assert (found["collisions"], found["safe_starts"], found["relative_excess"]) == (5, 200, pytest.approx(0.3))
 
 
 def test_the_excess_of_a_run_is_the_median_over_types():
     rows = [result((k, k), 0, 9, cost) for k, cost in enumerate((1.0, 2.0, 7.0))]
-    assert pool(rows).relative_excess == pytest.approx(0.2)
+    assert pooled(rows).relative_excess == pytest.approx(0.2)
 
 
 def rate(recipe: Recipe) -> tuple[int, int]:

@@ -97,7 +97,7 @@ def test_a_folder_without_runs_is_refused(tmp_path, folder):
 )
 def test_rows_that_contradict_themselves_are_left_out_and_named(tmp_path, bad, reason):
     run = only(write_run(tmp_path / "run", {**DRONE, "table": [bad, row((2.0, 2.0), 1)]}, extras=False))
-    assert [entry.theta for entry in run.table] == [(2.0, 2.0)]
+    assert [entry["theta"] for entry in run.table] == [(2.0, 2.0)]
     assert any(reason in note for note in run.notes)
 
 
@@ -162,6 +162,6 @@ def test_every_model_of_an_evaluation_is_a_run(tmp_path):
     }
     first, second = load(write_run(tmp_path / "evaluation", results, extras=False)).runs
     assert (first.operator, second.operator) == ("hno", "sno")
-    assert [run.table[0].outcome.collisions for run in (first, second)] == [0, 1]
+    assert [run.table[0]["collisions"] for run in (first, second)] == [0, 1]
     assert [run.settings["checkpoint"] for run in (first, second)] == ["hno.ckpt", "sno.ckpt"]
     assert ["comparison" in run.entries for run in (first, second)] == [True, False]
