@@ -117,7 +117,7 @@ RECIPES: dict[str, dict[str, str]] = {
     "short losses": {
         "huber": f"{STEEP} loss.norm=huber",
         "l2": f"{STEEP} loss.norm=l2",
-        "free terminal value": f"{STEEP} operator.exact_terminal=false",
+        "free terminal value": f"{STEEP} function.exact_terminal=false",
         "balance": f"{STEEP} loss.balance=true",
         "costate 3": f"{STEEP} loss.weights.costate=3",
         "physical units": f"{STEEP} loss.scaled=false",
@@ -147,7 +147,7 @@ RECIPES: dict[str, dict[str, str]] = {
         "one net, tanh, 1e-2": "activation=tanh optimizer.lr=1e-2",
         "one net, tanh, 15 types": f"activation=tanh data.trajectories=75 data.types={FIFTEEN}",
         "one net, tanh, 4000, 400 labels a type": "activation=tanh trainer.max_steps=4000 data.trajectories=400",
-        "median of 3": "operator.members=3",
+        "median of 3": "function.members=3",
     },
     "types": {
         "4 types x 280": f"{CORNERS} data.trajectories=280",

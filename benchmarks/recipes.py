@@ -141,7 +141,7 @@ def compared(
     rows = []
     for seed in arguments.seeds:
         fixed = [f"game={game}", f"seed={seed}", f"trainer.threads={arguments.threads}", "logger=csv"]
-        settings = train_settings([*fixed, "operator.members=1", *overrides.split()])
+        settings = train_settings([*fixed, "function.members=1", *overrides.split()])
         folder = arguments.out / arguments.set / game / name / str(seed)
         content = run(settings, folder)
         if content["status"] != "trained":

@@ -85,7 +85,7 @@ def small_architecture(
 ) -> Architecture:
     """What a small operator is built of."""
     return Architecture(
-        Choice("gradient", {"exact_terminal": exact_terminal, "members": members}),
+        Choice("value", {"exact_terminal": exact_terminal, "members": members}),
         Choice("deeponet", {"width": width, "depth": depth}),
         Choice(activation),
     )

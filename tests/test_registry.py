@@ -44,7 +44,7 @@ class Axolotl:
 """
 GROUPS = {
     "game": "hno.games",
-    "operator": "hno.operators",
+    "function": "hno.operators",
     "network": "hno.networks",
     "activation": "hno.activations",
     "loss": "hno.losses",
@@ -271,7 +271,7 @@ def test_classes_know_their_names(animals):
     [
         ("hno.games", "games", {"drone", "lane_change", "narrow_road"}),
         ("hno.losses", "losses", {"boundary", "costate", "residual", "value"}),
-        ("hno.operators", "operators", {"gradient"}),
+        ("hno.operators", "functions", {"potential", "value"}),
         ("hno.operators", "networks", {"deeponet"}),
         ("hno.operators", "activations", {"relu", "sin", "tanh"}),
         ("hno.data", "sources", {"band", "box", "labels", "rollout"}),

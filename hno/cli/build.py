@@ -62,15 +62,15 @@ def build(settings: TrainSettings, report: Report | None = None) -> Built:
         settings: of the training.
         report: is told how many labels are solved.
     """
-    game, function = make(settings.game.name, **settings.game.constants), dict(settings.operator)
-    function["name"] = function.pop("function")
-    parts = [dict(part) for part in (function, settings.network, settings.activation)]
+    game = make(settings.game.name, **settings.game.constants)
+    parts = [dict(part) for part in (settings.function, settings.network, settings.activation)]
     architecture = Architecture(*(Choice(part.pop("name"), part) for part in parts))
     operator, objective = make_operator(game, architecture), make_objective(**settings.loss.model_dump())
     needed = objective.streams(exact_terminal=operator.meets_terminal)
     plans = _labels(settings, game), _collocation(settings)
     sizes = settings.data.batch_sizes.model_dump()
-    return Built(architecture, operator, objective, GameData(game, needed, settings.seed, *plans, sizes, report))
+    data = GameData(game, needed, settings.seed, *plans, sizes, report, operator.potential)
+    return Built(architecture, operator, objective, data)
 
 
 def _labels(settings: TrainSettings, game: Game) -> LabelPlan:
@@ -80,6 +80,7 @@ def _labels(settings: TrainSettings, game: Game) -> LabelPlan:
         types=() if none else parse_types(game, data.types),
         trajectories=data.trajectories,
         validation=data.validation,
+        widen=data.widen,
         files=[Path(file) for file in data.files],
         cache=Path(data.cache or default_cache()),
         workers=data.workers,

@@ -28,7 +28,7 @@ from hno.cli.schema import GIVEN, REGISTRIES, S, SettingsError, validated
 from hno.cli.settings import TrainSettings
 from hno.registry import options_of, plural, unknown_name
 
-CHOSEN = ("game", "operator", "network", "activation", "optimizer")
+CHOSEN = ("game", "function", "network", "activation", "optimizer")
 """Groups whose choices are registered; methods of `operator` are files, its functions become methods."""
 
 
@@ -82,10 +82,9 @@ def register_plugins() -> None:
     for group in CHOSEN:
         registry, have = REGISTRIES[group](), choices(group)
         for name in registry.names():
-            if have.get(name) is None and (group, name) != ("operator", "gradient"):  # that of our own methods
+            if have.get(name) is None:
                 options = options_of(registry.get(name), skip=GIVEN.get(group, ()))
-                package = "_global_" if group == "operator" else group
-                ConfigStore.instance().store(group=group, name=name, node=_node(group, name, options), package=package)
+                ConfigStore.instance().store(group=group, name=name, node=_node(group, name, options), package=group)
 
 
 def _node(group: str, name: str, options: Mapping[str, Any]) -> Any:
@@ -97,8 +96,6 @@ def _node(group: str, name: str, options: Mapping[str, Any]) -> Any:
     node = {"name": name, **{k: list(v) if type(v) is tuple else v for k, v in found.items() if isinstance(v, plain)}}
     if group == "optimizer":
         return {"lr": 3e-3, "schedule": "cosine", "final_lr": 3e-5, **node}
-    if group == "operator":  # with the terms of `operator=hno`
-        return {"operator": {"function": name, **node}, "loss": OmegaConf.load(config_dir() / "operator/hno.yaml").loss}
     return node
 
 

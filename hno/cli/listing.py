@@ -11,10 +11,10 @@ from hno.cli.help import heading
 from hno.cli.schema import REGISTRIES
 from hno.registry import Description, plural, unknown_name
 
-KINDS = ("game", "method", "operator", "network", "activation", "loss", "source", "optimizer")
+KINDS = ("game", "method", "function", "network", "activation", "loss", "source", "optimizer")
 ABOUT = {
-    "method": "operator=NAME: loss terms, weights and the function that is trained",
-    "operator": "operator.function=NAME",
+    "method": "operator=NAME: loss terms and their weights",
+    "function": "function=NAME: what is learned; auto is the potential where the game has one",
     "loss": "loss.terms.NAME={...} and loss.weights.NAME",
     "source": "sampler.NAME.share, of collocation points",
 }

@@ -80,7 +80,7 @@ REGISTRIES: Mapping[str, Callable[[], Registry[Any]]] = {
     kind: partial(pkgutil.resolve_name, place)
     for kind, place in {
         "game": "hno.games:games",
-        "operator": "hno.operators:operators",
+        "function": "hno.operators:functions",
         "network": "hno.operators:networks",
         "activation": "hno.operators:activations",
         "loss": "hno.losses:losses",
@@ -90,13 +90,13 @@ REGISTRIES: Mapping[str, Callable[[], Registry[Any]]] = {
 }
 """The registry of every kind, as a function that imports it."""
 GIVEN = {
-    "operator": ("game", "network"),
+    "function": ("game", "network"),
     "network": ("inputs", "activation"),
     "optimizer": ("params", "parameters", "lr"),
 }
 """Arguments of constructors that the package passes: they are no options."""
 SHARED = ("exact_terminal", "members")
-"""Options of an operator that files of games and methods set."""
+"""Options of a function that files of games and of the choice `auto` set."""
 SCHEDULE: Mapping[str, Any] = {"lr": (Positive, ...), "schedule": (str, ...), "final_lr": (Positive, ...)}
 """Entries of an optimiser that belong to the schedule of its rate."""
 
@@ -139,18 +139,23 @@ def _several(kind: str, also: Mapping[str, Any] = {}) -> AfterValidator:  # it i
     return AfterValidator(check)
 
 
-def _operator(content: dict[str, Any], info: ValidationInfo) -> dict[str, Any]:
-    """A method's name, its registered function and all of that function's options.
+def _function(content: dict[str, Any], info: ValidationInfo) -> dict[str, Any]:
+    """A registered function and all of its options; `auto` is the potential where the game has one.
 
-    Files of games and methods set `SHARED` options; a function that does not know them is not given them.
+    Files of games set `SHARED` options; a function that does not know them is not given them.
     """
-    schema = _schema("operator", content.get("function"), {"name": (str, ...), "function": (str, ...)})
-    given = {key for key in SHARED if f"operator.{key}" in (info.context or {}).get("given", ())}
+    if content.get("name") == AUTO:
+        chosen = info.data.get("game")  # none where the game itself is refused
+        content = {**content, "name": "potential" if chosen is not None and chosen.potential else "value"}
+    schema = _schema("function", content.get("name"), {"name": (str, ...)})
+    given = {key for key in SHARED if f"function.{key}" in (info.context or {}).get("given", ())}
     dropped = set(SHARED) - schema.model_fields.keys() - given
     return validated(schema, {k: v for k, v in content.items() if k not in dropped}).model_dump()
 
 
-Operator = Annotated[dict[str, Any], AfterValidator(_operator)]
+AUTO = "auto"
+"""The name of the function that follows the game."""
+Function = Annotated[dict[str, Any], AfterValidator(_function)]
 Network = Annotated[dict[str, Any], _part("network")]
 Activation = Annotated[dict[str, Any], _part("activation")]
 Optimizer = Annotated[dict[str, Any], _part("optimizer", SCHEDULE)]

@@ -8,6 +8,7 @@ from pydantic import BeforeValidator, Field
 
 from hno.cli import schema
 from hno.cli.schema import Amount, Count, Loose, Positive, Seed, Settings, Share, Size, Text
+from hno.games import games
 
 
 class GameSettings(Settings):
@@ -15,6 +16,17 @@ class GameSettings(Settings):
 
     name: Text
     constants: dict[str, Any]
+
+    @property
+    def potential(self) -> bool:
+        """Whether it is a potential game; not where it is unknown, which its first use says."""
+        return self.name in games.names() and games.get(self.name).potential
+
+
+class Method(Settings):
+    """The name of a method; its loss terms are under `loss`."""
+
+    name: Text
 
 
 class BatchSizes(Settings):
@@ -29,6 +41,7 @@ class DataSettings(Settings):
     """Labels and the curriculum."""
 
     types: Loose | None
+    widen: Annotated[list[Positive], Field(min_length=1)]
     trajectories: Size
     validation: Size
     batch_sizes: BatchSizes
@@ -109,7 +122,8 @@ class TrainSettings(Settings):
     """`hno train`."""
 
     game: GameSettings
-    operator: schema.Operator
+    operator: Method
+    function: schema.Function
     network: schema.Network
     activation: schema.Activation
     data: DataSettings

@@ -41,7 +41,8 @@ def head(settings: TrainSettings) -> dict[str, Any]:
     """What results.json says from the beginning."""
     return {
         "game": settings.game.name,
-        "operator": settings.operator["name"],
+        "operator": settings.operator.name,
+        "function": settings.function["name"],
         "activation": settings.activation["name"],
         "seed": settings.seed,
         "steps": settings.trainer.max_steps,
@@ -69,7 +70,7 @@ def train_operator(settings: TrainSettings, folder: Path, results: Results) -> F
     L.seed_everything(settings.seed, verbose=False)
     use_threads(settings.trainer.threads)
     architecture, operator, objective, data = build(settings, label_progress())
-    origin = Provenance(settings.operator["name"], data.type_list, settings.seed, config_hash(settings))
+    origin = Provenance(settings.operator.name, data.type_list, settings.seed, config_hash(settings))
     entries, makers = record(data.game, architecture, origin), loggers(settings, folder)
     resume = None if settings.resume is None else find_checkpoint(settings.resume, [LAST])
     if resume is not None:

@@ -15,6 +15,7 @@ from hno.evaluation import format as text
 from hno.evaluation.outcome import Outcome, outcome, pooled
 from hno.evaluation.sections import COUNTS, Column, Evaluation, ModelSection, Type, sections
 from hno.games import Game
+from hno.games.base import own_costate
 from hno.types import Extremal, Status, Trajectory
 
 
@@ -68,14 +69,18 @@ def collision_table(evaluation: Evaluation) -> list[TypeRow]:
 def label_errors(policy: Feedback, found: Extremal) -> tuple[float | None, float | None]:
     """Weighted absolute percentage errors of values and costates at the nodes of converged labels, as in training.
 
-    The sum of absolute errors over the sum of absolute labels; None where no label converged.
+    Costates of a potential are own ones. The sum of absolute errors over the sum of absolute labels; None where no label converged.
     """
     if not bool((found.status == Status.CONVERGED).any()):
         return None, None
     points, labels, _ = rows_of(policy.game, [found])
     assert labels is not None
     predicted = policy.operator.field(points)
-    pairs = (predicted.value, labels.value), (predicted.costate, labels.costate)
+    if predicted.players is None:
+        pairs = (predicted.value, labels.value), (predicted.costate, labels.costate)
+    else:
+        own = own_costate(labels.costate).unsqueeze(-3)
+        pairs = (predicted.players, labels.value), (predicted.costate, own)
     value, costate = (float(weighted_mean_absolute_percentage_error(*pair)) for pair in pairs)
     return value, costate
 

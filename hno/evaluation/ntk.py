@@ -177,9 +177,13 @@ def check_rows(operator: ValueOperator, rows: object) -> None:
     Raises:
         ValueError: either of these.
     """
+    if operator.potential:
+        raise ValueError(
+            "ntk=true is for the players' values, which function=value learns; this operator learns a potential."
+        )
     members, least = len(operator.members), rows_per_point(operator)
     if members > 1:
-        raise ValueError(f"ntk=true is for one net, this operator has {members}. Train it with operator.members=1.")
+        raise ValueError(f"ntk=true is for one net, this operator has {members}. Train it with function.members=1.")
     if not (type(rows) is int and rows >= least):
         raise ValueError(f"ntk_rows must be a whole number of at least {least}, the rows of one point; got {rows!r}.")
 

@@ -15,8 +15,8 @@ from hno.losses import Scales, View
 from hno.registry import Registry
 from hno.types import Field, Points, Sample, Types
 
-operators: Registry[Any] = Registry("operator", "hno.operators")
-"""Subclasses of `ValueOperator`."""
+functions: Registry[Any] = Registry("function", "hno.operators")
+"""What is learned: subclasses of `ValueOperator`."""
 
 FieldFunction = Callable[[Points, Types | None], Field]
 """As `ValueOperator.field`."""
@@ -25,7 +25,7 @@ FieldFunction = Callable[[Points, Types | None], Field]
 class ValueOperator(nn.Module, abc.ABC):
     """V(tau, x, theta) of every player of a game, in physical units.
 
-    A registered operator is built as `cls(game, network, **options)`, see `hno.operators.build`.
+    A registered class is built as `cls(game, network, **options)`, see `hno.operators.build`.
 
     Args:
         game: the game.

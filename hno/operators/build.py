@@ -9,7 +9,7 @@ from typing import Any
 
 from hno.games import Game
 from hno.operators.activations import activations
-from hno.operators.base import ValueOperator, operators
+from hno.operators.base import ValueOperator, functions
 from hno.operators.network import networks
 from hno.registry import check_options
 
@@ -26,7 +26,7 @@ class Choice:
 class Architecture:
     """What an operator is built of."""
 
-    operator: Choice = Choice("gradient")
+    function: Choice = Choice("value")
     network: Choice = Choice("deeponet")
     activation: Choice = Choice("sin")
 
@@ -38,12 +38,12 @@ def make_operator(game: Game, architecture: Architecture = Architecture()) -> Va
         UnknownNameError: a part is not registered, or does not know an option.
         ValueError: an option that makes no sense, see the part.
     """
-    operator, network, activation = architecture.operator, architecture.network, architecture.activation
+    function, network, activation = architecture.function, architecture.network, architecture.activation
     make_activation = activations.get(activation.name)
     check_options(f"activation {activation.name}", make_activation, activation.options)
     make_network = networks.get(network.name)
     check_options(f"network {network.name}", make_network, network.options, skip=("inputs", "activation"))
-    cls = operators.get(operator.name)
-    check_options(f"operator {operator.name}", cls, operator.options, skip=("game", "network"))
+    cls = functions.get(function.name)
+    check_options(f"function {function.name}", cls, function.options, skip=("game", "network"))
     parts = functools.partial(make_activation, **activation.options)
-    return cls(game, functools.partial(make_network, activation=parts, **network.options), **operator.options)
+    return cls(game, functools.partial(make_network, activation=parts, **network.options), **function.options)

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.func import jacrev
 
 from hno.games import Game
-from hno.operators.base import FieldFunction, ValueOperator, operators
+from hno.operators.base import FieldFunction, ValueOperator, functions
 from hno.operators.deeponet import DeepONet
 from hno.operators.inputs import Encoding, distinct_types
 from hno.operators.network import Inputs, Network
@@ -21,7 +21,7 @@ from hno.types import Field, Points, Types
 
 
 @final
-@operators.register("gradient")
+@functions.register("value")
 class GradientOperator(ValueOperator):
     """One value per player from one network; derivatives are the network's own.
 
@@ -42,7 +42,7 @@ class GradientOperator(ValueOperator):
     ) -> None:
         if not (type(members) is int and members > 0 and members % 2):
             raise ValueError(
-                "operator.members must be an odd whole number, such as 1 or 3, so that there is a median; "
+                "function.members must be an odd whole number, such as 1 or 3, so that there is a median; "
                 f"got {members!r}."
             )
         super().__init__(game)

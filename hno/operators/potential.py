@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.func import jacrev
 
 from hno.games import Game
-from hno.operators.base import ValueOperator, operators
+from hno.operators.base import ValueOperator, functions
 from hno.operators.deeponet import DeepONet
 from hno.operators.inputs import JointEncoding, distinct_types
 from hno.operators.network import Inputs, Network
@@ -23,7 +23,7 @@ MOST = 64
 
 
 @final
-@operators.register("potential")
+@functions.register("potential")
 class PotentialOperator(ValueOperator):
     """The potential W of all players, and every player's value V_i; controls follow from dW / dx_i alone.
 

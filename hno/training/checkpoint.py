@@ -20,7 +20,7 @@ from hno.registry import UnknownNameError
 
 KEY = "hno"
 """Checkpoint entry that says how to build the operator and where it comes from."""
-FORMAT = 3
+FORMAT = 4
 """Version of that entry."""
 
 
@@ -195,9 +195,10 @@ class LearnedPolicy(Feedback):
         return [tuple(theta) for theta in self.provenance.types]
 
     def names(self) -> dict[str, str]:
-        """Names of game, method and activation."""
-        game = games.name_of(type(self.game))
-        return {"game": game, "operator": self.provenance.method, "activation": self.architecture.activation.name}
+        """Names of game, method, function and activation."""
+        game, parts = games.name_of(type(self.game)), self.architecture
+        chosen = {"function": parts.function.name, "activation": parts.activation.name}
+        return {"game": game, "operator": self.provenance.method, **chosen}
 
 
 def load_policy(path: str | Path, game: str | None = None, threads: int = 1) -> LearnedPolicy:

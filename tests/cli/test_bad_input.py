@@ -26,7 +26,7 @@ from tests.conftest import TEST, TRAIN
         ("experiment=smok", "'smoke'"),
         ("logger=wandbb", "'wandb'"),
         ("game.name=dron", "'drone'"),
-        ("operator.function=gradientt", "'gradient'"),
+        ("function=valuee", "'value'"),
         ("network=deepnet", "'deeponet'"),
         ("network.name=deepnet", "'deeponet'"),
         ("network.widht=8", "'width'"),
@@ -98,11 +98,11 @@ def test_types_inside_the_range_warn_of_nothing(command: Command) -> None:
             "network.depth", "data.validation", "data.workers", "trainer.validate_every", "trainer.print_every",
             "trainer.threads", "optimizer.lr",
         )),
-        *((f"operator.members={number}", "operator.members must be an odd whole number, such as 1 or 3")
+        *((f"+function.members={number}", "function.members must be an odd whole number, such as 1 or 3")
           for number in ("0", "2")),
-        *((f"operator.members={number}", "operator.members must be a valid integer")
+        *((f"+function.members={number}", "function.members must be a valid integer")
           for number in ("1.5", "true", "null", "three")),
-        ("operator.exact_terminal=1", "operator.exact_terminal must be a valid boolean"),
+        ("function.exact_terminal=1", "function.exact_terminal must be a valid boolean"),
         ("data.batch_sizes.bvp=0", "data.batch_sizes.bvp must be greater than or equal to 1; got 0"),
         ("data.batch_sizes.interior=-8", "data.batch_sizes.interior must be greater than or equal to 1; got -8"),
         ("optimizer.lr=-0.1", "optimizer.lr must be greater than 0; got -0.1"),

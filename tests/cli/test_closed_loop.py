@@ -257,7 +257,7 @@ def test_the_best_checkpoint_goes_along_with_a_resumed_run(command: Command, sco
 
 ROLLOUT = ("sampler=rollout", "data.pretrain=0")
 ALL_ELSE = (
-    "loss.balance=true", "loss.hardest=0.5", "operator.exact_terminal=true", "optimizer=muon",
+    "loss.balance=true", "loss.hardest=0.5", "function.exact_terminal=true", "optimizer=muon",
     "optimizer.schedule=linear",
 )  # fmt: skip
 

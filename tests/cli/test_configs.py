@@ -62,7 +62,7 @@ def test_every_experiment_builds_for_every_game_and_operator(experiment: str, ga
 
 
 @pytest.mark.parametrize(
-    ("overrides", "members"), [((), 3), (("experiment=paper_grid",), 1), (("operator.members=5",), 5)]
+    ("overrides", "members"), [((), 3), (("experiment=paper_grid",), 1), (("function.members=5",), 5)]
 )
 def test_the_drone_is_a_median_of_nets_unless_asked_otherwise(overrides: tuple[str, ...], members: int) -> None:
     assert settings("game=drone", *overrides).operator["members"] == members

@@ -137,7 +137,7 @@ def test_cache_is_that_of_the_environment_by_default(
         ({"game": "narow_road"}, "Did you mean 'narrow_road'?"),
         *(({name: None}, f"{name} is missing") for name in ("theta", "n")),
         ({"starts": "5"}, "starts does not exist"),
-        ({"operator.members": "1"}, "operator does not exist"),
+        ({"function.members": "1"}, "operator does not exist"),
         *(({"n": n}, "n must be a valid integer") for n in ("1.5", "many", "null", "true")),
         *(({name: "0"}, f"{name} must be greater than or equal to 1; got 0") for name in ("n", "workers")),
         ({"seed": "-1"}, "seed must be greater than or equal to 0; got -1"),

@@ -50,7 +50,7 @@ def test_training_can_end_with_the_kernel(command: Command) -> None:
     [
         ("evaluation.ntk_rows=19", "must be"),
         ("evaluation.ntk=maybe", "must be"),
-        ("operator.members=3", "ntk=true is for one net, this operator has 3. Train it with operator.members=1"),
+        ("function.members=3", "ntk=true is for one net, this operator has 3. Train it with function.members=1"),
     ],
 )
 def test_a_training_that_cannot_is_refused_before_it_begins(command: Command, override: str, message: str) -> None:

@@ -115,7 +115,7 @@ class Shallow(Network):
 
 
 class Wrapped(ValueOperator):
-    """The gradient operator in another class."""
+    """The operator of values in another class."""
 
     def __init__(self, game: Game, network: Callable[[Inputs], Network], exact_terminal: bool = True) -> None:
         super().__init__(game)
@@ -164,7 +164,7 @@ def sgd(params: Iterable[nn.Parameter], lr: float, momentum: float = 0.5) -> tor
 
 
 FOREIGN = {
-    "activation": ("softsign", Softsign), "network": ("shallow", Shallow), "operator": ("wrapped", Wrapped),
+    "activation": ("softsign", Softsign), "network": ("shallow", Shallow), "function": ("wrapped", Wrapped),
     "loss": ("small", Small), "source": ("early", Early), "optimizer": ("sgd", sgd),
 }  # fmt: skip
 
@@ -177,7 +177,7 @@ def foreign() -> None:
 
 
 CHOSEN = (
-    "activation=softsign", "network=shallow", "operator=wrapped", "optimizer=sgd", "sampler.early=1",
+    "activation=softsign", "network=shallow", "function=wrapped", "optimizer=sgd", "sampler.early=1",
     "loss.terms.small={}", "loss.weights.small=0.1", "trainer.max_steps=3", "data.pretrain=0", "data.finish=0",
 )  # fmt: skip
 
@@ -190,17 +190,17 @@ def test_a_part_of_every_kind_from_outside_trains_with_its_defaults(command: Com
     found = run.results["config"]
     assert found["activation"] == {"name": "softsign", "sharpness": 1.0}
     assert found["network"] == {"name": "shallow", "hidden": 8}
-    assert found["operator"] == {"name": "wrapped", "function": "wrapped", "exact_terminal": True}
+    assert found["function"] == {"name": "wrapped", "exact_terminal": True}
     assert found["loss"]["terms"]["small"] == {"power": 1.0}
     assert found["sampler"]["early"] == {"share": 1, "share_of_horizon": 0.5}
     assert (found["optimizer"]["name"], found["optimizer"]["momentum"]) == ("sgd", 0.5)
-    assert hno.load_policy(run.folder / "last.ckpt").names()["operator"] == "wrapped"
+    assert hno.load_policy(run.folder / "last.ckpt").names()["function"] == "wrapped"
 
 
 @pytest.mark.usefixtures("foreign", "no_labels")
 def test_every_option_of_a_part_from_outside_can_be_set_and_no_other(command: Command) -> None:
     changes = {
-        "activation.sharpness": 2.0, "network.hidden": 4, "operator.exact_terminal": False, "loss.terms.small.power": 2,
+        "activation.sharpness": 2.0, "network.hidden": 4, "function.exact_terminal": False, "loss.terms.small.power": 2,
         "sampler.early.share_of_horizon": 0.1, "optimizer.momentum": 0.9,
     }  # fmt: skip
     run = command("train", *SMOKE, *CHOSEN, *(f"{key}={value}" for key, value in changes.items()), "--dry-run")
@@ -211,16 +211,15 @@ def test_every_option_of_a_part_from_outside_can_be_set_and_no_other(command: Co
         wrong = command("train", *SMOKE, *CHOSEN, f"{key}s=1")
         assert wrong.code != 0
         assert f"Did you mean {key.split('.')[-1]!r}?" in wrong.text
-    refused = command("train", *SMOKE, *CHOSEN, "operator.members=3")
-    assert "operator.members does not exist" in refused.text
-    assert "Known: exact_terminal, function, name." in refused.text
+    refused = command("train", *SMOKE, *CHOSEN, "function.members=3")
+    assert "function.members does not exist" in refused.text
+    assert "Known: exact_terminal, name." in refused.text
 
 
 @pytest.mark.usefixtures("foreign", "no_labels")
 def test_what_a_game_sets_for_our_operator_is_no_option_of_another(command: Command) -> None:
-    assert command("train", *SMOKE, "operator=wrapped", "game=drone", "--dry-run").code == 0
-    swapped = command("train", *SMOKE, "operator.function=wrapped", "--dry-run")
-    assert OmegaConf.create(swapped.text).operator == {"name": "hno", "function": "wrapped", "exact_terminal": True}
+    swapped = command("train", *SMOKE, "function=wrapped", "game=drone", "--dry-run")
+    assert OmegaConf.create(swapped.text).function == {"name": "wrapped", "exact_terminal": True}
 
 
 @pytest.mark.usefixtures("foreign", "no_labels")

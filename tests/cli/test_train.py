@@ -71,7 +71,7 @@ def test_five_steps(command: Command, game: str, operator: str, activation: str)
 @pytest.mark.parametrize(("finish", "hybrid"), [(0, [2, 3, 4]), (0.4, [2]), (1, [])])
 def test_collocation_comes_between_the_supervised_phases(command: Command, finish: float, hybrid: list[int]) -> None:
     """Of five steps, two are supervised only; then the residual joins, and what is logged ends with it."""
-    phases = "data.pretrain=0.4", f"data.finish={finish}", "operator.exact_terminal=false"
+    phases = "data.pretrain=0.4", f"data.finish={finish}", "function.exact_terminal=false"
     run = command("train", *SMOKE, *phases, "trainer.max_steps=5", "trainer.print_every=1")
     lines = [line for line in run.text.splitlines() if "step " in line and " of 5:" in line]
     for term in ("loss/residual", "loss/boundary"):

@@ -31,7 +31,7 @@ def architecture(
 ) -> Architecture:
     """A small operator."""
     return Architecture(
-        Choice("gradient", {"exact_terminal": exact_terminal, "members": members}),
+        Choice("value", {"exact_terminal": exact_terminal, "members": members}),
         Choice("deeponet", {"width": width, "depth": depth}),
         Choice(activation),
     )

@@ -92,6 +92,6 @@ def test_a_checkpoint_keeps_every_member(make_operator: MakeOperator, tmp_path: 
 @pytest.mark.parametrize("members", [0, 2, -1, 1.0, True, None, "three"])
 def test_an_ensemble_needs_a_median(make_operator: MakeOperator, members: object) -> None:
     with pytest.raises(
-        ValueError, match=rf"operator.members must be an odd whole number, such as 1 or 3.*got {members!r}\."
+        ValueError, match=rf"function.members must be an odd whole number, such as 1 or 3.*got {members!r}\."
     ):
         make_operator(members=members)
