@@ -10,6 +10,7 @@ from hno.control.rollout import Disturbance
 
 GRID5 = [(float(a), float(b)) for a, b in itertools.product(range(1, 6), repeat=2)]
 GRID9 = [(a / 2, b / 2) for a, b in itertools.product(range(2, 11), repeat=2)]
+TWELVE = [*itertools.product((1.0, 2.0, 4.0), repeat=2), (1.0, 5.0), (3.0, 3.0), (5.0, 2.0)]
 BEYOND = [(1.0, 6.0), (3.0, 6.0), (5.0, 6.0), (5.5, 5.5), (6.0, 6.0)]
 
 
@@ -26,6 +27,12 @@ class Suite(NamedTuple):
     """Of the starts."""
     disturbance: Disturbance = Disturbance()
     """Of the controls."""
+    symmetric: bool = False
+    """Whether all players start in the same own state."""
+    ties: bool = False
+    """Whether two equilibria of every start cost within 1 %."""
+    box: tuple[list[list[float]], list[list[float]]] | None = None
+    """Where starts are drawn, in place of the game's start box."""
 
 
 SUITES = {
@@ -37,10 +44,16 @@ SUITES = {
     "2 x box": Suite(GRID5, 40, widen=2.0),
     "noise": Suite(GRID5, 40, disturbance=Disturbance(noise=0.2)),
     "delay": Suite(GRID5, 40, disturbance=Disturbance(delay=1)),
+    "noise and delay": Suite(GRID5, 40, disturbance=Disturbance(noise=0.2, delay=1)),
+    "belief": Suite(GRID5, 40, disturbance=Disturbance(belief=0.5)),
+    "3 x box": Suite(GRID5, 40, widen=3.0),
+    "symmetric": Suite(GRID5, 12, symmetric=True),
+    "ties": Suite(TWELVE, 25, ties=True),
+    "head-on": Suite(GRID5, 40, box=([[22.5, 3.75, 0, 18]] * 2, [[27.5, 4.25, 0, 18]] * 2)),
 }
 FEWER = {"drone": 0.3}
 """Share of the starts above that a game gets, because most of its starts collide inevitably."""
-MOST = {"half types": 256, "beyond": 512, "1.5 x box": 256, "2 x box": 256}
+MOST = {"half types": 256, "beyond": 512, "1.5 x box": 256, "2 x box": 256, "3 x box": 256, "symmetric": 256}
 """Start states of a type after which the search for safe ones ends, where it is not 4096."""
 
 CORNERS = "data.types=[[1,1],[1,5],[5,1],[5,5]]"
@@ -49,12 +62,25 @@ HNO = f"operator=hno {TO_THE_END}"
 HARDENING = f"{HNO} loss.terms.residual=null loss.weights.residual=null ++loss.weights.annealed=0.02"
 FINISHED = "operator=hno data.pretrain=0.2 data.widening=0.2 data.finish=0.4"
 LATE = "operator=hno data.pretrain=0.4 data.widening=0.2 data.finish=0.2"
+VALUES = "function=value function.members=1 data.widen=[1.0]"
+"""What every recipe is that does not choose what it learns."""
 SHORT = "activation=tanh trainer.max_steps=1000"
 FIFTEEN = str([[a, b] for a, b in itertools.combinations_with_replacement(range(1, 6), 2)]).replace(" ", "")
 STEEP = f"{SHORT} optimizer.lr=1e-2"
 TEN = f"{STEEP} {CORNERS} data.trajectories=10"
 ANY = f"{HNO} {STEEP} {CORNERS} data.trajectories=200 data.interior_types=box"
+MIXED_BOXES = "data.widen=[1.0,2.2]"
 RECIPES: dict[str, dict[str, str]] = {
+    "potential": {
+        "sno, V, start box": VALUES,
+        "sno, V, mixed boxes": f"function=value function.members=1 {MIXED_BOXES}",
+        "hno, V, start box": f"{VALUES} operator=hno",
+        "hno, V, mixed boxes": f"function=value function.members=1 {MIXED_BOXES} operator=hno",
+        "sno, W, start box": "function=potential data.widen=[1.0]",
+        "sno, W, mixed boxes": f"function=potential {MIXED_BOXES}",
+        "hno, W, start box": "function=potential data.widen=[1.0] operator=hno",
+        "hno, W, mixed boxes": f"function=potential {MIXED_BOXES} operator=hno",
+    },
     "default": {
         "sno, sin": "",
         "sno, tanh": "activation=tanh",

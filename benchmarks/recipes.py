@@ -21,7 +21,7 @@ from typing import Any
 
 import annealed  # noqa: F401  # registers a loss term
 import torch
-from recipe_sets import FEWER, MOST, RECIPES, SUITES
+from recipe_sets import FEWER, MOST, RECIPES, SUITES, VALUES
 from rich.console import Console
 from rich.table import Table
 
@@ -34,7 +34,7 @@ from hno.control.rollout import rollout
 from hno.data.certificates import safe
 from hno.data.labels import Request, default_cache, safe_labels_for
 from hno.evaluation.metrics import clopper_pearson
-from hno.games import make
+from hno.games import Box, make
 from hno.training.checkpoint import load_policy
 from hno.training.validation import Starts, starts_of
 from hno.types import part
@@ -54,7 +54,7 @@ def run(settings: TrainSettings, folder: Path) -> dict[str, Any]:
     (folder / "suites.json").unlink(missing_ok=True)
     head = {
         "game": settings.game.name,
-        "operator": settings.operator["name"],
+        "operator": settings.operator.name,
         "seed": settings.seed,
         "config_hash": key,
     }
@@ -69,13 +69,17 @@ def run(settings: TrainSettings, folder: Path) -> dict[str, Any]:
 
 def starts(game_name: str, suite: str) -> tuple[Starts, list[int]]:
     """Safe starts of a suite, and how many there are of each type."""
-    types, count, widen, split, _ = SUITES[suite]
-    count = max(1, round(FEWER.get(game_name, 1.0) * count))
-    game, seed = make(game_name), 0 if split == "validation" else 1000
-    requests = [Request(theta, count, seed, split, widen) for theta in types]
+    chosen, game = SUITES[suite], make(game_name)
+    if chosen.box is not None:
+        game.initial_box = Box(*chosen.box)
+    count = max(1, round(FEWER.get(game_name, 1.0) * chosen.starts))
+    seed = 0 if chosen.split == "validation" else 1000
+    kind = seed, chosen.split, chosen.widen, chosen.symmetric, chosen.ties
+    requests = [Request(theta, count, *kind) for theta in chosen.types]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # types beyond the box are meant
-        found, _ = safe_labels_for(game, requests, default_cache(), most=MOST.get(suite, 4096))
+        most = count if chosen.ties else MOST.get(suite, 4096)
+        found, _ = safe_labels_for(game, requests, default_cache(), most=most)
     kept = [part(labels, safe(labels)) for labels in found]
     return starts_of(kept), [len(labels.status) for labels in kept]
 
@@ -141,7 +145,8 @@ def compared(
     rows = []
     for seed in arguments.seeds:
         fixed = [f"game={game}", f"seed={seed}", f"trainer.threads={arguments.threads}", "logger=csv"]
-        settings = train_settings([*fixed, "function.members=1", *overrides.split()])
+        before = "" if "function=" in overrides else VALUES
+        settings = train_settings([*fixed, *before.split(), *overrides.split()])
         folder = arguments.out / arguments.set / game / name / str(seed)
         content = run(settings, folder)
         if content["status"] != "trained":

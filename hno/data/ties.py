@@ -18,7 +18,7 @@ APART = 1.0
 """Rotation, rad, by which best equilibria of two starts differ if they go different ways around each other."""
 HALVINGS = 10
 """Of the line between two starts, at most."""
-BATCH = 64
+BATCH = 32
 """Pairs of starts that are tried together."""
 MOST = 40
 """Pairs that are tried for one tie, at most."""
@@ -39,14 +39,22 @@ def tie_states(
         settings: of the solver.
 
     Returns:
-        Start states, float64, (count, P, n); fewer where `MOST` pairs for each do not have so many.
+        Start states, float64, (count, P, n).
+
+    Raises:
+        ValueError: `MOST` pairs for each do not have so many.
     """
     found, pairs = list[Tensor](), 0
     while len(found) < count and pairs < MOST * count:
         ends = draw(2 * (pairs + BATCH))[2 * pairs :].unflatten(0, (BATCH, 2))
         found += _between(game, theta, ends, settings)
         pairs += BATCH
-    return torch.stack(found[:count]) if found else draw(1)[:0]
+    if len(found) < count:
+        raise ValueError(
+            f"{type(game).__name__} has {len(found)} ties of two equilibria in {pairs} pairs of starts at types {theta}, "
+            f"{count} were asked for."
+        )
+    return torch.stack(found[:count])
 
 
 def tied(found: Extremal) -> Tensor:
