@@ -34,6 +34,8 @@ from hno.types import Extremal
 
 log = logging.getLogger(__name__)
 
+TIES = 25
+"""Ties that are played per type, at most: finding one takes some twenty labels."""
 Types = tuple[float, ...]
 """One type per player."""
 Table = list[dict[str, Any]]
@@ -92,8 +94,10 @@ def describe(
     solver = functools.partial(safe_labels_for, clearance=options["clearance"]) if options["safe"] else labels_for
 
     @functools.cache
-    def solve(widen: float, symmetric: bool) -> list[Extremal]:
-        requests = [Request(theta, options["starts"], options["seed"], "test", widen, symmetric) for theta in types]
+    def solve(widen: float, symmetric: bool, ties: bool) -> list[Extremal]:
+        starts = min(options["starts"], TIES) if ties else options["starts"]
+        kind = starts, options["seed"], "test", widen, symmetric, ties
+        requests = [Request(theta, *kind) for theta in types]
         return solver(game, requests, Path(cache or default_cache()), workers=workers, report=label_progress())[0]
 
     return [

@@ -24,6 +24,10 @@ MOST = 40
 """Pairs that are tried for one tie, at most."""
 
 
+class TooFewTiesError(ValueError):
+    """A game in which two ways around each other hardly ever cost the same."""
+
+
 def tie_states(
     game: Game, theta: tuple[float, ...], count: int, draw: Callable[[int], Tensor], settings: Solver = Solver()
 ) -> Tensor:
@@ -42,7 +46,7 @@ def tie_states(
         Start states, float64, (count, P, n).
 
     Raises:
-        ValueError: `MOST` pairs for each do not have so many.
+        TooFewTiesError: `MOST` pairs for each do not have so many.
     """
     found, pairs = list[Tensor](), 0
     while len(found) < count and pairs < MOST * count:
@@ -50,9 +54,9 @@ def tie_states(
         found += _between(game, theta, ends, settings)
         pairs += BATCH
     if len(found) < count:
-        raise ValueError(
-            f"{type(game).__name__} has {len(found)} ties of two equilibria in {pairs} pairs of starts at types {theta}, "
-            f"{count} were asked for."
+        raise TooFewTiesError(
+            f"{type(game).__name__} has {len(found)} ties of two equilibria in {pairs} pairs of starts at types "
+            f"{theta}; {count} were asked for."
         )
     return torch.stack(found[:count])
 

@@ -69,7 +69,8 @@ def collision_table(evaluation: Evaluation) -> list[TypeRow]:
 def label_errors(policy: Feedback, found: Extremal) -> tuple[float | None, float | None]:
     """Weighted absolute percentage errors of values and costates at the nodes of converged labels, as in training.
 
-    Costates of a potential are own ones. The sum of absolute errors over the sum of absolute labels; None where no label converged.
+    Costates of a potential are own ones. The sum of absolute errors over the sum of absolute labels; None where no
+    label converged.
     """
     if not bool((found.status == Status.CONVERGED).any()):
         return None, None

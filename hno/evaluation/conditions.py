@@ -19,12 +19,14 @@ class Condition(NamedTuple):
     """Width of the start box in units of the game's."""
     symmetric: bool = False
     """Whether all players start in the same own state."""
+    ties: bool = False
+    """Whether the two cheapest equilibria of every start cost nearly the same, see `hno.data.ties`."""
     disturbance: Disturbance = Disturbance()
 
     @property
-    def starts(self) -> tuple[float, bool]:
+    def starts(self) -> tuple[float, bool, bool]:
         """What its start states depend on."""
-        return self.widen, self.symmetric
+        return self.widen, self.symmetric, self.ties
 
     def entries(self) -> dict[str, Any]:
         """What differs from undisturbed episodes in the game's own start box, by the names of `ENTRIES`."""
@@ -40,6 +42,7 @@ _AMOUNT = "a finite number of at least 0", _amount
 ENTRIES: Mapping[str, tuple[str, Callable[[Any], bool]]] = {
     "widen": ("a positive number", lambda value: _amount(value) and value > 0),
     "symmetric": ("true or false", lambda value: isinstance(value, bool)),
+    "ties": ("true or false", lambda value: isinstance(value, bool)),
     "noise": _AMOUNT,
     "delay": ("a whole number of at least 0", lambda value: type(value) is int and value >= 0),
     "drift": _AMOUNT,

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from hno.data.labels import interchangeable
+from hno.data.ties import TooFewTiesError
 from hno.evaluation import format as text
 from hno.evaluation.closed_loop import play
 from hno.evaluation.conditions import Condition, read_conditions
@@ -43,7 +44,11 @@ class Robustness(ModelSection):
             if condition.symmetric and not interchangeable(game):
                 log.info("Condition %s is left out: the players of this game are not interchangeable.", condition.name)
                 continue
-            labels = evaluation.solve(condition)
+            try:
+                labels = evaluation.solve(condition)
+            except TooFewTiesError as error:
+                log.warning("Condition %s is left out: %s", condition.name, error)
+                continue
             played = play(game, evaluation.policy, labels, evaluation.dt, condition.disturbance)
             by_type, whole = outcomes(game, labels, played, evaluation.clearance)
             types = [
