@@ -60,7 +60,8 @@ def collision_table(evaluation: Evaluation) -> list[TypeRow]:
     for found, played in zip(evaluation.labels, evaluation.played, strict=True):
         theta = tuple(found.theta[0].tolist())
         extrapolated = not bool(box.contains(found.theta[0].to(box.lo)))
-        outside = any(not min(c) <= t <= max(c) for t, *c in zip(theta, *known, strict=True)) if known else False
+        ranges = [(min(column), max(column)) for column in zip(*known, strict=True)]
+        outside = any(not low <= own <= high for own, (low, high) in zip(theta, ranges, strict=False))
         came, errors = outcome(game, found, played, evaluation.clearance), label_errors(evaluation.policy, found)
         rows.append(TypeRow(theta, theta in known, extrapolated, outside, came, *errors))
     return rows

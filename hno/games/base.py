@@ -209,7 +209,10 @@ class Game(FinalMethods, nn.Module, abc.ABC):
         """
         checked = []
         for theta in types:
-            entries = _numbers(theta)
+            try:
+                entries = tuple(map(float, theta))
+            except (TypeError, ValueError):  # no sequence of numbers
+                entries = ()
             if len(entries) != self.players or not all(map(math.isfinite, entries)):
                 raise ValueError(f"theta must be {self.players} finite numbers, one per player; got {theta!r}.")
             self.check_theta(torch.tensor(entries, device=self.type_box.lo.device))
@@ -247,14 +250,6 @@ class Game(FinalMethods, nn.Module, abc.ABC):
     def fingerprint(self) -> str:
         """Hash of the game's boxes and of its functions at fixed points: it changes when the physics does."""
         return fingerprint(self)
-
-
-def _numbers(entries: object) -> tuple[float, ...]:
-    """Entries of a sequence as floats; none if it is no sequence of numbers."""
-    try:
-        return tuple(float(entry) for entry in entries)  # type: ignore[attr-defined]  # that is what is tried
-    except (TypeError, ValueError):
-        return ()
 
 
 def own_costate(costate: Tensor) -> Tensor:
