@@ -45,32 +45,47 @@ class Labels(NamedTuple):
     """What an operator is supervised with, at the points of the same row."""
 
     value: Tensor
-    """V_i = -J_i, shape (B, P); or the potential W, shape (B, 1)."""
+    """V_i = -J_i, shape (B, P)."""
     costate: Tensor
-    """dV_i / dx_j, shape (B, P, P, n), or dW / dx_j, shape (B, 1, P, n)."""
-    players: Tensor | None = None
-    """V_i where the value is W, shape (B, P)."""
-    best: Tensor | None = None
-    """Whether no other equilibrium of the same start has a larger W, bool, shape (B,)."""
+    """dV_i / dx_j, shape (B, P, P, n)."""
 
-    def rows(self, index: Tensor) -> Labels:
-        """Some of the points."""
-        known = {name: column[index] for name, column in self._asdict().items() if column is not None}
-        return Labels(**known)
+
+class PotentialLabels(NamedTuple):
+    """What an operator of a potential is supervised with, at the points of the same row."""
+
+    value: Tensor
+    """W, shape (B, 1)."""
+    costate: Tensor
+    """dW / dx_j, shape (B, 1, P, n)."""
+    players: Tensor
+    """V_i, shape (B, P)."""
+    best: Tensor
+    """Whether no other equilibrium of the same start has a larger W, bool, shape (B,)."""
 
 
 class Field(NamedTuple):
-    """Value functions and their derivatives at some points: those of the players, Q = P, or a potential, Q = 1."""
+    """A value function and its derivatives at some points."""
 
     value: Tensor
-    """V_i or W, shape (B, Q)."""
+    """V_i, shape (B, P)."""
     dvalue_dtau: Tensor
-    """Derivative in time to go, 1/s, shape (B, Q)."""
+    """Derivative in time to go, 1/s, shape (B, P)."""
     costate: Tensor
-    """dV_i / dx_j or dW / dx_j, shape (B, Q, P, n)."""
-    players: Tensor | None = None
-    """V_i where the value is W, shape (B, P)."""
-    branches: Tensor | None = None
+    """dV_i / dx_j, shape (B, P, P, n)."""
+
+
+class PotentialField(NamedTuple):
+    """A potential and its derivatives at some points, which have the names of a value function's."""
+
+    value: Tensor
+    """W of the branch that is asked for or the best one, shape (B, 1)."""
+    dvalue_dtau: Tensor
+    """Derivative in time to go, 1/s, shape (B, 1)."""
+    costate: Tensor
+    """dW / dx_j, shape (B, 1, P, n)."""
+    players: Tensor
+    """V_i, shape (B, P)."""
+    branches: Tensor
     """W of every branch, -inf for those that no label has, shape (B, branches)."""
 
 
@@ -78,7 +93,7 @@ class Sample(NamedTuple):
     """One stream of a training batch: points, and labels where the stream has them."""
 
     points: Points
-    labels: Labels | None = None
+    labels: Labels | PotentialLabels | None = None
     types: Types | None = None
     """The points' theta as a table; None where nobody has made one."""
 
@@ -91,7 +106,7 @@ class Sample(NamedTuple):
         """Some of the rows."""
         return Sample(
             Points(*(column[index] for column in self.points)),
-            None if self.labels is None else self.labels.rows(index),
+            None if self.labels is None else type(self.labels)(*(column[index] for column in self.labels)),
             None if self.types is None else self.types.rows(index),
         )
 

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from hno.games import Game
 from hno.operators.base import ValueOperator
-from hno.types import Points
+from hno.types import Points, PotentialField
 
 
 class Policy(abc.ABC):
@@ -99,7 +99,7 @@ class Feedback(nn.Module, Policy):
     def value(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
         """V_i of every player, (B,), (B, P, n), (B, P) -> (B, P). Raises as `act`."""
         field = self.operator.field(self._points(tau, x, theta))
-        return (field.value if field.players is None else field.players).to(x.dtype)
+        return (field.players if isinstance(field, PotentialField) else field.value).to(x.dtype)
 
     def potential(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
         """W of an operator of a potential, (B,), (B, P, n), (B, P) -> (B,).
@@ -107,8 +107,7 @@ class Feedback(nn.Module, Policy):
         Raises:
             ValueError: as `act`, or the operator has none.
         """
-        self._require_potential()
-        return self.operator.field(self._points(tau, x, theta)).value.squeeze(-1).to(x.dtype)
+        return self._potential_field(tau, x, theta).value.squeeze(-1).to(x.dtype)
 
     def branch(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
         """Which branch of a potential is played, int64, (B,), (B, P, n), (B, P) -> (B,); see `hno.data.branches`.
@@ -116,14 +115,13 @@ class Feedback(nn.Module, Policy):
         Raises:
             ValueError: as `act`, or the operator has none.
         """
-        self._require_potential()
-        branches = self.operator.field(self._points(tau, x, theta)).branches
-        assert branches is not None
-        return branches.argmax(-1)
+        return self._potential_field(tau, x, theta).branches.argmax(-1)
 
-    def _require_potential(self) -> None:
-        if not self.operator.potential:
+    def _potential_field(self, tau: Tensor, x: Tensor, theta: Tensor) -> PotentialField:
+        field = self.operator.field(self._points(tau, x, theta))
+        if not isinstance(field, PotentialField):
             raise ValueError("This policy knows the players' values, no potential: train it with function=potential.")
+        return field
 
     def costate(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
         """dV_i / dx_j, (B,), (B, P, n), (B, P) -> (B, P, P, n), or dW / dx_j, (B, 1, P, n). Raises as `act`."""

@@ -20,7 +20,7 @@ from hno.data.plans import BATCH_SIZES, Collocation, LabelPlan
 from hno.data.rows import converged, potential_rows, rows_of
 from hno.data.sources import Known, Pool, sample_points
 from hno.games import Game
-from hno.types import Batch, Extremal, Sample, Trajectory, Types, best_of, of_starts
+from hno.types import Batch, Extremal, PotentialLabels, Sample, Trajectory, Types, best_of, of_starts
 
 BOX_TYPES = 32
 """Types that one batch of collocation points draws from the type box: the branch runs once for each."""
@@ -155,8 +155,7 @@ class GameData(L.LightningDataModule):
             self.train_rows = potential_rows(self.game, trained, self.branches, swapped=True)
             self.val_rows = potential_rows(self.game, held_out, self.branches)
             labels = self.train_rows.labels
-            assert labels is not None
-            assert labels.best is not None
+            assert isinstance(labels, PotentialLabels)
             self.drawn = torch.cat([torch.arange(self.train_rows.size), labels.best.nonzero().squeeze(-1)])
         else:
             self.train_rows, self.val_rows = rows_of(self.game, trained), rows_of(self.game, held_out)

@@ -11,7 +11,7 @@ from torch import Tensor
 from hno.data.branches import branch_of
 from hno.games import Game
 from hno.games.base import own_costate
-from hno.types import Extremal, Labels, Points, Sample, Status, Types, part
+from hno.types import Extremal, Labels, Points, PotentialLabels, Sample, Status, Types, part
 
 
 class NoLabelsError(RuntimeError):
@@ -59,7 +59,9 @@ def potential_rows(game: Game, extremals: Sequence[Extremal], axes: Tensor, *, s
             nodes.append((*(column.float() for column in rows), best.unsqueeze(-1).expand_as(tau), branch))
     columns = [torch.cat([part.flatten(0, 1) for part in column]) for column in zip(*nodes, strict=True)]
     tau, x, theta, value, own, players, best, branch = columns
-    return Sample(Points(tau, x, theta), Labels(value, own, players, best), _types(theta)._replace(branch=branch))
+    return Sample(
+        Points(tau, x, theta), PotentialLabels(value, own, players, best), _types(theta)._replace(branch=branch)
+    )
 
 
 def orders(game: Game) -> Iterator[list[int]]:

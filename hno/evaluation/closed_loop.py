@@ -16,7 +16,7 @@ from hno.evaluation.outcome import Outcome, outcome, pooled
 from hno.evaluation.sections import COUNTS, Column, Evaluation, ModelSection, Type, sections
 from hno.games import Game
 from hno.games.base import own_costate
-from hno.types import Extremal, Status, Trajectory
+from hno.types import Extremal, PotentialField, Status, Trajectory
 
 
 class TypeRow(NamedTuple):
@@ -78,11 +78,11 @@ def label_errors(policy: Feedback, found: Extremal) -> tuple[float | None, float
     points, labels, _ = rows_of(policy.game, [found])
     assert labels is not None
     predicted = policy.operator.field(points)
-    if predicted.players is None:
-        pairs = (predicted.value, labels.value), (predicted.costate, labels.costate)
-    else:
+    if isinstance(predicted, PotentialField):
         own = own_costate(labels.costate).unsqueeze(-3)
         pairs = (predicted.players, labels.value), (predicted.costate, own)
+    else:
+        pairs = (predicted.value, labels.value), (predicted.costate, labels.costate)
     value, costate = (float(weighted_mean_absolute_percentage_error(*pair)) for pair in pairs)
     return value, costate
 

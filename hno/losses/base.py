@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from hno.games import Game
 from hno.games.potential import Problem
 from hno.registry import Registry
-from hno.types import Field, Points, Sample
+from hno.types import Field, Points, PotentialField, Sample
 
 losses: Registry[LossTerm] = Registry("loss", "hno.losses")
 
@@ -36,9 +36,9 @@ class View(NamedTuple):
     """Whose Hamilton-Jacobi equation it is: the game, or its `Team` where a potential is learned."""
     sample: Sample
     """The rows of the term's stream, B of them."""
-    field: Field
+    field: Field | PotentialField
     """The operator at these rows, differentiable in its parameters."""
-    at: Callable[[Points], Field]
+    at: Callable[[Points], Field | PotentialField]
     """The operator at any other points, differentiable in its parameters."""
     scales: Scales
     step: int

@@ -8,10 +8,10 @@ from torch import Tensor
 
 from hno.games.potential import Problem
 from hno.losses.base import LossTerm, View, losses
-from hno.types import Field, Points
+from hno.types import Field, Points, PotentialField
 
 
-def hji_residual(problem: Problem, points: Points, field: Field) -> Tensor:
+def hji_residual(problem: Problem, points: Points, field: Field | PotentialField) -> Tensor:
     """HJI residual dV/dtau - max_u H of every player (B, P), or of the potential (B, 1).
 
     Zero for an exact equilibrium value (paper, eq. 3, in time to go).

@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from hno.losses.base import LossTerm, View, losses
-from hno.types import Labels
+from hno.types import Labels, PotentialField, PotentialLabels
 
 
-def _labels(view: View) -> Labels:
+def _labels(view: View) -> Labels | PotentialLabels:
     if view.sample.labels is None:
         raise ValueError("A supervised term needs the labelled stream 'bvp'; this sample has points only.")
     return view.sample.labels
@@ -28,9 +28,9 @@ class ValueDeviation(LossTerm):
         """(B, P), or (B, 1 + P) of a potential."""
         labels, field = _labels(view), view.field
         off = field.value - labels.value
-        if labels.players is None or field.players is None:
-            return off
-        return torch.cat([off, field.players - labels.players], -1)
+        if isinstance(labels, PotentialLabels) and isinstance(field, PotentialField):
+            return torch.cat([off, field.players - labels.players], -1)
+        return off
 
     def scale(self, view: View) -> Tensor:
         """Size of values."""
@@ -65,9 +65,12 @@ class OtherBranches(LossTerm):
 
     def residual(self, view: View) -> Tensor:
         """(B, branches)."""
-        labels, types, branches = _labels(view), view.sample.types, view.field.branches
-        if branches is None or labels.best is None or types is None or types.branch is None:
-            return torch.zeros_like(view.field.value)
+        labels, field, types = _labels(view), view.field, view.sample.types
+        if not isinstance(labels, PotentialLabels) or not isinstance(field, PotentialField):
+            return torch.zeros_like(field.value)
+        assert types is not None
+        assert types.branch is not None
+        branches = field.branches
         own = torch.arange(branches.shape[-1], device=branches.device) == types.branch.unsqueeze(-1)
         counts = labels.best.unsqueeze(-1) & ~own
         return (branches - labels.value).clamp_min(0) * counts

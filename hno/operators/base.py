@@ -13,12 +13,12 @@ from hno.games import Game
 from hno.games.potential import Problem, Team
 from hno.losses import Scales, View
 from hno.registry import Registry
-from hno.types import Field, Points, Sample, Types
+from hno.types import Field, Points, PotentialField, Sample, Types
 
 functions: Registry[Any] = Registry("function", "hno.operators")
 """What is learned: subclasses of `ValueOperator`."""
 
-FieldFunction = Callable[[Points, Types | None], Field]
+FieldFunction = Callable[[Points, Types | None], Field | PotentialField]
 """As `ValueOperator.field`."""
 
 
@@ -50,7 +50,7 @@ class ValueOperator(nn.Module, abc.ABC):
         self.register_buffer("costate_scale", torch.ones(functions, game.players, game.state_dim))
 
     @abc.abstractmethod
-    def field(self, points: Points, types: Types | None = None) -> Field:
+    def field(self, points: Points, types: Types | None = None) -> Field | PotentialField:
         """Value, time derivative and every costate, of all players at once, or of the potential.
 
         With gradients enabled the result is differentiable in the parameters, but not in the points: see `value`.
@@ -80,7 +80,13 @@ class ValueOperator(nn.Module, abc.ABC):
         """The value."""
         return self.value(tau, x, theta)
 
-    def view(self, sample: Sample, field: Field, at: Callable[[Points], Field] | None = None, step: int = 0) -> View:
+    def view(
+        self,
+        sample: Sample,
+        field: Field | PotentialField,
+        at: Callable[[Points], Field | PotentialField] | None = None,
+        step: int = 0,
+    ) -> View:
         """What a loss term sees of the operator, whose field at the sample is given; `at` is `field` by default."""
         return View(self.game, self.problem, sample, field, at or self.field, self.scales, step)
 

@@ -83,17 +83,18 @@ class GradientOperator(ValueOperator):
     def field(self, points: Points, types: Types | None = None) -> Field:
         """Value, time derivative and every costate of all players: medians over the members, entry by entry."""
         types = types or distinct_types(points.theta)
-        found = [member(points, types) for member in self.members]
+        found = [self._member(network, points, types) for network in self._networks()]
         if len(found) == 1:
             return found[0]
-        columns = zip(*((f.value, f.dvalue_dtau, f.costate) for f in found), strict=True)
-        return Field(*(torch.stack(parts).median(0).values for parts in columns))
+        return Field(*(torch.stack(parts).median(0).values for parts in zip(*found, strict=True)))
 
     @property
     def members(self) -> Sequence[FieldFunction]:
         """The field of every network."""
-        networks = (network for network in self.networks if isinstance(network, Network))
-        return [functools.partial(self._member, network) for network in networks]
+        return [functools.partial(self._member, network) for network in self._networks()]
+
+    def _networks(self) -> list[Network]:
+        return [network for network in self.networks if isinstance(network, Network)]
 
     def _member(self, network: Network, points: Points, types: Types | None = None) -> Field:
         """The field of one network."""

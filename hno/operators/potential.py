@@ -16,7 +16,7 @@ from hno.operators.deeponet import DeepONet
 from hno.operators.inputs import JointEncoding, distinct_types
 from hno.operators.network import Inputs, Network
 from hno.operators.value_gradient import compiled
-from hno.types import Field, Points, Types
+from hno.types import Points, PotentialField, Types
 
 MOST = 64
 """Branches that an operator may have; each costs one more product for every row."""
@@ -91,7 +91,7 @@ class PotentialOperator(ValueOperator):
         best = branches.argmax(-1)
         return _chosen(players, best), _chosen(slopes, best).unsqueeze(0)
 
-    def field(self, points: Points, types: Types | None = None) -> Field:
+    def field(self, points: Points, types: Types | None = None) -> PotentialField:
         """W, its derivatives and V_i, of the branch in `types` or the best one."""
         tau, x, theta = points
         types = types or distinct_types(theta)
@@ -115,7 +115,7 @@ class PotentialOperator(ValueOperator):
                 (push,) = torch.autograd.grad(end.sum(), at)
             value = end.detach() + share * value
             costate = push.unsqueeze(-3) + share[..., None, None, None] * costate
-        return Field(value.unsqueeze(-1), slope.unsqueeze(-1), costate, _chosen(players, branch), branches)
+        return PotentialField(value.unsqueeze(-1), slope.unsqueeze(-1), costate, _chosen(players, branch), branches)
 
     def branch(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
         """Which branch is played, (B,), (B, P, n), (B, P) -> (B,)."""

@@ -13,7 +13,7 @@ from torchmetrics import WeightedMeanAbsolutePercentageError
 from hno.losses import Objective, View
 from hno.operators.base import FieldFunction, ValueOperator
 from hno.operators.inputs import distinct_types, tables
-from hno.types import Batch, Field, Points, Sample
+from hno.types import Batch, Field, Points, PotentialField, Sample
 
 Optimizer = Callable[[Iterable[nn.Parameter]], Mapping[str, Any]]
 """Builds what Lightning's `configure_optimizers` returns."""
@@ -61,13 +61,14 @@ class TrainingModule(L.LightningModule):
         sizes = [sample.size for sample in kept.values()]
         reduced = list[list[Tensor]]()
         for member in self.operator.members:
-            columns = [[None] * len(sizes) if part is None else part.split(sizes) for part in member(points, types)]
-            fields = dict(zip(kept, (Field(*parts) for parts in zip(*columns, strict=True)), strict=True))
+            field = member(points, types)
+            columns = zip(*(part.split(sizes) for part in field), strict=True)
+            fields = dict(zip(kept, (type(field)(*parts) for parts in columns), strict=True))
             views = {stream: self._view(kept[stream], fields[stream], member) for stream in kept}
             reduced.append([self.objective.reduced(name, views[stream]) for name, stream in read.items()])
         return {name: torch.stack(each).mean() for name, each in zip(read, zip(*reduced, strict=True), strict=True)}
 
-    def _view(self, sample: Sample, field: Field, member: FieldFunction) -> View:
+    def _view(self, sample: Sample, field: Field | PotentialField, member: FieldFunction) -> View:
         return self.operator.view(sample, field, lambda at: member(at, None), self.global_step)
 
     def _hardest(self, stream: str, sample: Sample) -> Sample:

@@ -161,7 +161,7 @@ def test_tables_are_joined_one_after_the_other() -> None:
     expected = torch.cat([part.distinct[part.which] for part in parts])
     assert torch.equal(joined.distinct[joined.which], expected)
     assert joined.which.tolist() == [1, 0, 1, 2, 2, 5, 4, 3, 3]
-    assert all(map(torch.equal, tables(parts[:1]), parts[0]))
+    assert all(map(torch.equal, tables(parts[:1])[:2], parts[0][:2]))
 
 
 @pytest.mark.parametrize("index", [torch.tensor([4, 0, 0]), torch.tensor([True, False, True, False, False, True])])
