@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
+import pkgutil
 import sys
 from pathlib import Path
 from typing import Any
@@ -41,14 +41,13 @@ def _class(name: str) -> Any:
     """The class of a file in this folder."""
     from hno.games import Game
 
-    module, _, cls = name.partition(":")
     sys.path.insert(0, str(Path.cwd()))
     try:
-        found = getattr(importlib.import_module(module), cls, None)
+        found = pkgutil.resolve_name(name)
     finally:
         sys.path.remove(str(Path.cwd()))
     if not (isinstance(found, type) and issubclass(found, Game)):
-        raise UnknownNameError(f"{module} has no class {cls!r} that is a Game.")
+        raise UnknownNameError("{0} has no class {2!r} that is a Game.".format(*name.partition(":")))
     return found
 
 

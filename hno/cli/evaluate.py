@@ -115,10 +115,10 @@ def evaluate(settings: EvaluateSettings, results: Results) -> None:
         for policy, evaluation in zip(policies, evaluations, strict=True)
     ]
     results.update(**models[0])
-    labels, played = solve_tests(evaluations[0], results), list[Evaluation]()
+    played = list[Evaluation]()
     for model, evaluation in zip(models, evaluations, strict=True):
         log.info("evaluation of %s", evaluation.name)
-        found, model["table"] = play_starts(evaluation, labels, results)
+        found, model["table"] = play_starts(evaluation, results)
         played.append(found)
         for name, content in run_sections(found, results):
             model[name] = content
@@ -158,31 +158,28 @@ def unseen_types(game: Game, choice: Any, key: str) -> list[Types]:
     return [] if choice == [] else parse_types(game, choice, key=key)
 
 
-def solve_tests(evaluation: Evaluation, results: Results) -> list[Extremal]:
-    """Labels of the test starts of every type, from the cache or solved."""
-    began = time.perf_counter()
-    labels = list(evaluation.solve(evaluation.condition))
-    results.time("test_labels", time.perf_counter() - began)
-    results.update(test_seed=evaluation.condition.disturbance.seed)
-    return labels
+def play_starts(evaluation: Evaluation, results: Results) -> tuple[Evaluation, Table]:
+    """Play from the test starts, whose labels are in the cache or solved now.
 
-
-def play_starts(evaluation: Evaluation, labels: Sequence[Extremal], results: Results) -> tuple[Evaluation, Table]:
-    """Play from the starts of the labels. The first model's table goes into the results, and some episodes are kept.
+    The first model's table goes into the results, and some of its episodes are kept.
 
     Returns:
-        The evaluation with its episodes, and the rows of its table.
+        The evaluation with its labels and episodes, and the rows of its table.
     """
     began, game, folder = time.perf_counter(), evaluation.game, results.path.parent
-    played = play(game, evaluation.policy, labels, evaluation.dt, evaluation.condition.disturbance)
+    labels, disturbance = list(evaluation.solve(evaluation.condition)), evaluation.condition.disturbance
+    solved = time.perf_counter()
+    played = play(game, evaluation.policy, labels, evaluation.dt, disturbance)
     found = evaluation._replace(labels=labels, played=played)
     table = CollisionTable().compute(found)
-    results.time("evaluation", time.perf_counter() - began)
+    results.time("test_labels", solved - began)
+    results.time("evaluation", time.perf_counter() - solved)
     if results.content["episodes"] is None:
         kept = episodes(found)
         write_json(folder / EPISODES, kept)
         conditions = {name: found.options[name] for name in ("clearance", "dt", "widen", "noise", "delay")}
-        results.update(**conditions, constraint_unit=game.constraint_unit, table=table, episodes=EPISODES)
+        results.update(**conditions, test_seed=disturbance.seed, constraint_unit=game.constraint_unit)
+        results.update(table=table, episodes=EPISODES)
         draw_typical(kept["episodes"], folder / "rollout.png", title_of(results.content))
     return found, table
 

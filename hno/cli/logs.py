@@ -58,10 +58,6 @@ def quiet_lightning() -> Iterator[None]:
         logger.setLevel(before)
 
 
-class LoggerMissingError(RuntimeError):
-    """The optional package of a logger is not installed."""
-
-
 def use_threads(count: int | None) -> None:
     """Let torch use so many threads; None for its own choice."""
     if count is not None:
@@ -72,7 +68,7 @@ def loggers(settings: TrainSettings, folder: Path) -> list[Logger]:
     """The chosen loggers, each once.
 
     Raises:
-        LoggerMissingError: the package of a logger is not installed.
+        RuntimeError: the package of a logger is not installed.
         ValueError: W&B cannot run as asked for.
     """
     made: list[Logger] = []
@@ -84,7 +80,7 @@ def loggers(settings: TrainSettings, folder: Path) -> list[Logger]:
                 made.append(TensorBoardLogger(folder, name="", version="tensorboard", default_hp_metric=False))
             except ModuleNotFoundError as error:
                 message = "TensorBoard is not installed: `pip install tensorboard`, or choose logger=csv."
-                raise LoggerMissingError(message) from error
+                raise RuntimeError(message) from error
         elif (mode := wandb_mode(settings.logger.mode)) != "disabled":
             made.append(
                 WandbLogger(

@@ -13,7 +13,7 @@ import lightning as L
 from hno.cli import launch
 from hno.cli.arguments import Arguments
 from hno.cli.build import build, check, how_to_train
-from hno.cli.evaluate import describe, play_starts, solve_tests, unseen_types
+from hno.cli.evaluate import describe, play_starts, unseen_types
 from hno.cli.logs import StepBar, StepLines, label_progress, loggers, use_threads
 from hno.cli.media import publish
 from hno.cli.results import Results, config_hash
@@ -59,7 +59,7 @@ def train(settings: TrainSettings, results: Results) -> None:
     types = [*policy.types, *unseen_types(policy.game, chosen.types, "evaluation.types")]
     models = [(str(results.content["checkpoint"]), policy)]
     (evaluation,) = describe(models, types, chosen.model_dump(), settings.data.cache, settings.data.workers)
-    played, _ = play_starts(evaluation, solve_tests(evaluation, results), results)
+    played, _ = play_starts(evaluation, results)
     for name, content in run_sections(played, results):
         results.update(**{name: content})
     publish(fitted.trainer.loggers, results.content, folder, fitted.trainer.global_step)

@@ -156,7 +156,7 @@ def make_trainer(
         max_epochs=-1,
         gradient_clip_val=settings.gradient_clip_val,
         val_check_interval=min(every, settings.steps),
-        limit_val_batches=1.0 if validates else 0,  # Lightning warns of a loader without rows
+        limit_val_batches=None if validates else 0,  # Lightning warns of a loader without rows
         check_val_every_n_epoch=None,
         num_sanity_val_steps=0,
         log_every_n_steps=max(1, min(50, settings.steps)),

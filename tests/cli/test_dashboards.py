@@ -147,7 +147,7 @@ def test_tensorboard_that_is_not_installed(command: Command, monkeypatch: pytest
     monkeypatch.setattr(fabric, "_TENSORBOARDX_AVAILABLE", False)
     run = command("train", *SMOKE, "logger=tensorboard")
     refused(run, "TensorBoard is not installed: `pip install tensorboard`", "logger=csv")
-    assert run.results["reason"].startswith("LoggerMissingError")
+    assert run.results["reason"].startswith("RuntimeError: TensorBoard is not installed")
 
 
 @pytest.mark.usefixtures("no_labels")

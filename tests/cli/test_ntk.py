@@ -68,7 +68,7 @@ def test_no_kernel_unless_asked_for(command: Command, random_checkpoint: Path) -
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["ntk=yes please"], "ntk must be true or false; got 'yes please'"),
+        (["ntk=yes please"], "ntk must be a valid boolean; got 'yes please'"),
         (["ntk=true", "ntk_rows=19"], "ntk_rows must be a whole number of at least 20, the rows of one point; got 19"),
         (["ntk=true", "ntk_rows=many"], "ntk_rows must be"),
         (["ntk=true", "ntk_rows=true"], "ntk_rows must be"),

@@ -48,7 +48,11 @@ def test_it_is_off_by_default(command: Command, random_checkpoint: Path) -> None
 @pytest.mark.usefixtures("no_labels")
 @pytest.mark.parametrize(
     ("override", "message"),
-    [("online=-1", "online must be"), ("online=true", "online must be"), ("online_interval=0", "at least 1")],
+    [
+        ("online=-1", "online must be"),
+        ("online=true", "online must be"),
+        ("online_interval=0", "online_interval must be greater than or equal to 1; got 0"),
+    ],
 )
 def test_impossible_settings(command: Command, random_checkpoint: Path, override: str, message: str) -> None:
     refused(command("evaluate", f"checkpoint={random_checkpoint}", *FAST, override), message)
