@@ -115,6 +115,22 @@ Batch = dict[str, Sample]
 """A training batch: stream name -> sample."""
 
 
+def tables(parts: Sequence[Types]) -> Types:
+    """One table for several batches of points, one after the other."""
+    offsets = itertools.accumulate((len(part.distinct) for part in parts), initial=0)
+    which = [part.which + offset for part, offset in zip(parts, offsets, strict=False)]
+    branch = [torch.full_like(part.which, -1) if part.branch is None else part.branch for part in parts]
+    known = any(part.branch is not None for part in parts)
+    return Types(torch.cat([part.distinct for part in parts]), torch.cat(which), torch.cat(branch) if known else None)
+
+
+def joined(samples: Sequence[Sample]) -> Sample:
+    """Labelled samples of one kind, one after the other."""
+    points, labels, types = zip(*samples, strict=True)
+    columns = (torch.cat(parts) for parts in zip(*labels, strict=True))
+    return Sample(Points(*map(torch.cat, zip(*points, strict=True))), type(labels[0])(*columns), tables(types))
+
+
 class Status(IntEnum):
     """How a boundary value problem ended."""
 

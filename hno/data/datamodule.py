@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import hashlib
 import math
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import lightning as L
@@ -20,7 +20,19 @@ from hno.data.plans import BATCH_SIZES, Collocation, LabelPlan
 from hno.data.rows import converged, potential_rows, rows_of
 from hno.data.sources import Known, Pool, sample_points
 from hno.games import Game
-from hno.types import Batch, Extremal, PotentialLabels, Sample, Trajectory, Types, best_of, of_starts
+from hno.types import (
+    Batch,
+    Extremal,
+    Labels,
+    Points,
+    PotentialLabels,
+    Sample,
+    Trajectory,
+    Types,
+    best_of,
+    joined,
+    of_starts,
+)
 
 BOX_TYPES = 32
 """Types that one batch of collocation points draws from the type box: the branch runs once for each."""
@@ -95,11 +107,12 @@ class GameData(L.LightningDataModule):
         self.label_seconds = 0.0
         self.extremals: list[Extremal] = []
         self.train_rows: Sample | None = None
-        self.drawn = torch.empty(0, dtype=torch.int64)
-        """Rows that batches are drawn from: the best equilibria are there twice, the others once."""
+        self._joined: tuple[int, Sample, Tensor] | None = None
         self.val_rows: Sample | None = None
         self.visits: list[Visit] = []
         """The latest two validations."""
+        self.added: list[tuple[int, Sample]] = []
+        """Labelled rows that were added after a training step."""
 
     def _check(self) -> None:
         if self.collocation.types not in ("labelled", "box"):
@@ -154,12 +167,29 @@ class GameData(L.LightningDataModule):
             self.branches = principal_axes(self.game, converged(self.game, trained))
             self.train_rows = potential_rows(self.game, trained, self.branches, swapped=True)
             self.val_rows = potential_rows(self.game, held_out, self.branches)
-            labels = self.train_rows.labels
-            assert isinstance(labels, PotentialLabels)
-            self.drawn = torch.cat([torch.arange(self.train_rows.size), labels.best.nonzero().squeeze(-1)])
         else:
             self.train_rows, self.val_rows = rows_of(self.game, trained), rows_of(self.game, held_out)
-            self.drawn = torch.arange(self.train_rows.size)
+
+    def extend(self, step: int, labels: Sequence[Extremal]) -> None:
+        """Train on more labels, of the game or what remains of it, from the batch after the next one of a step on."""
+        if any(len(found.status) for found in labels):
+            rows = potential_rows(self.game, labels, self.branches, swapped=True) if self.branches is not None else None
+            self.added.append((step, rows_of(self.game, labels) if rows is None else rows))
+
+    def rows(self, step: int) -> tuple[Sample, Tensor]:
+        """Labelled rows of a step, and the ones of them that a batch is drawn from: best equilibria count twice.
+
+        Batches are drawn a step ahead: what was added just before does not count.
+        """
+        known = [rows for after, rows in self.added if after < step]
+        if self._joined is None or self._joined[0] != len(known):
+            assert self.train_rows is not None
+            whole = joined([self.train_rows, *known])
+            drawn, labels = torch.arange(whole.size), whole.labels
+            if isinstance(labels, PotentialLabels):
+                drawn = torch.cat([drawn, labels.best.nonzero().squeeze(-1)])
+            self._joined = len(known), whole, drawn
+        return self._joined[1:]
 
     def _split(self) -> Iterator[tuple[Extremal, int]]:
         """Labels of every set, and how many of its start states are held out."""
@@ -198,11 +228,16 @@ class GameData(L.LightningDataModule):
 
     def state_dict(self) -> dict[str, Any]:
         """What batches depend on besides the step."""
-        return {"visits": [visit._asdict() for visit in self.visits]}
+        return {"visits": [visit._asdict() for visit in self.visits], "added": [_plain(*entry) for entry in self.added]}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore it."""
         self.visits = [Visit(**visit) for visit in state_dict["visits"]]
+        kinds = {True: PotentialLabels, False: Labels}
+        self.added = [
+            (step, Sample(Points(*points), kinds[self.potential](*labels), Types(*types)))
+            for step, points, labels, types in state_dict["added"]
+        ]
 
     def batch(self, step: int, sizes: Mapping[str, int | None] | None = None) -> Batch:
         """The batch of one step, a pure function of (seed, step, rank), and of earlier `visits`.
@@ -213,11 +248,10 @@ class GameData(L.LightningDataModule):
         """
         sizes = sizes or self.batch_sizes
         rank = self.trainer.global_rank if self.trainer is not None else 0
-        generator = torch.Generator().manual_seed(_mix(step, self.seed, rank))
+        generator = torch.Generator().manual_seed(mix(step, self.seed, rank))
         batch: Batch = {}
         if "bvp" in self.streams and self.train_rows is not None:
-            rows, size = self.train_rows, sizes["bvp"]
-            drawn = self.drawn
+            (rows, drawn), size = self.rows(step), sizes["bvp"]
             chosen = drawn if size is None else drawn[torch.randint(len(drawn), (size,), generator=generator)]
             batch["bvp"] = rows.rows(chosen)
         if self.collocation.curriculum.active(step):
@@ -262,6 +296,13 @@ class GameData(L.LightningDataModule):
         return [] if self.val_rows is None else DataLoader([self.val_rows], batch_size=None)  # type: ignore[arg-type]  # a list is a data set
 
 
+def _plain(step: int, rows: Sample) -> list[Any]:
+    """Added rows as plain containers, for checkpoints."""
+    assert rows.labels is not None
+    assert rows.types is not None
+    return [step, list(rows.points), list(rows.labels), list(rows.types)]
+
+
 class _Steps(IterableDataset[Batch]):
     def __init__(self, data: GameData, first: int) -> None:
         self.data, self.first = data, first
@@ -273,7 +314,7 @@ class _Steps(IterableDataset[Batch]):
             step += 1
 
 
-def _mix(step: int, *run: int) -> int:
+def mix(step: int, *run: int) -> int:
     """A generator seed for a step of a run; no two steps of a run share one.
 
     It has 32 bits because PyTorch's CPU generator reads no more: whatever stands higher would be ignored.

@@ -25,7 +25,7 @@ def rows_of(game: Game, extremals: Sequence[Extremal]) -> Sample:
         NoLabelsError: none converged.
     """
     found = converged(game, extremals)
-    nodes = [(*_points(game, each), each.value, each.costate) for each in found]
+    nodes = [(*_points(each), each.value, each.costate) for each in found]
     tau, x, theta, value, costate = (torch.cat([p.flatten(0, 1) for p in c]).float() for c in zip(*nodes, strict=True))
     return Sample(Points(tau, x, theta), Labels(value, costate), _types(theta))
 
@@ -52,7 +52,7 @@ def potential_rows(game: Game, extremals: Sequence[Extremal], axes: Tensor, *, s
             )
         best = best_equilibria(found)
         for order in orders(game) if swapped else [list(range(game.players))]:
-            tau, x, theta = _points(game, found)
+            tau, x, theta = _points(found)
             x, theta, own = x[:, :, order], theta[..., order], own_costate(found.costate)[:, :, order]
             branch = branch_of(game, x, axes).unsqueeze(-1).expand_as(tau)
             rows = tau, x, theta, found.potential.unsqueeze(-1), own.unsqueeze(-3), found.value[..., order]
@@ -92,10 +92,10 @@ def converged(game: Game, extremals: Sequence[Extremal]) -> list[Extremal]:
     return [each for each in found if len(each.status)]
 
 
-def _points(game: Game, found: Extremal) -> tuple[Tensor, Tensor, Tensor]:
+def _points(found: Extremal) -> tuple[Tensor, Tensor, Tensor]:
     """Times to go (B, K), states (B, K, P, n) and types (B, K, P) of the nodes."""
     count, nodes = len(found.status), len(found.t)
-    tau = (game.horizon - found.t).expand(count, -1)
+    tau = (found.t[-1] - found.t).expand(count, -1)
     return tau, found.x, found.theta.unsqueeze(1).expand(-1, nodes, -1)
 
 

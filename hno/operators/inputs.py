@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
@@ -132,12 +130,3 @@ def distinct_types(theta: Tensor) -> Types:
     """The different types among (B, P) as a table; this waits for the device."""
     distinct, which = theta.reshape(-1, theta.shape[-1]).unique(dim=0, return_inverse=True)
     return Types(distinct, which)
-
-
-def tables(parts: Sequence[Types]) -> Types:
-    """One table for several batches of points, one after the other."""
-    offsets = itertools.accumulate((len(part.distinct) for part in parts), initial=0)
-    which = [part.which + offset for part, offset in zip(parts, offsets, strict=False)]
-    branch = [torch.full_like(part.which, -1) if part.branch is None else part.branch for part in parts]
-    known = any(part.branch is not None for part in parts)
-    return Types(torch.cat([part.distinct for part in parts]), torch.cat(which), torch.cat(branch) if known else None)

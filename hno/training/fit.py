@@ -18,6 +18,7 @@ from hno.data import GameData
 from hno.data.certificates import safe_sets
 from hno.losses import Objective, Scales
 from hno.operators import ValueOperator
+from hno.training.adaptive import Adaptive, AdaptiveLabels, Round
 from hno.training.divergence import StopOnDivergence
 from hno.training.module import TrainingModule
 from hno.training.optimizers import make_optimizer
@@ -52,6 +53,8 @@ class Settings:
     gradient_clip_val: float | None = None
     polish: int = 0
     """Iterations of L-BFGS on all labelled rows after the last step."""
+    adaptive: Adaptive = field(default_factory=Adaptive)
+    """Labels that are added while training."""
     compile: bool = True
     """`torch.compile` in runs of at least `LONG` steps."""
 
@@ -69,8 +72,10 @@ class Fitted(NamedTuple):
     """Losses of the last step, and errors on held-out labels."""
     best: Score | None
     """Of closed-loop validation."""
+    rounds: list[Round]
+    """What was labelled while training."""
     seconds: dict[str, float]
-    """Time spent on training and on validation, s."""
+    """Time spent on training, on validation and on labels that were added, s."""
 
 
 def fit(
@@ -122,7 +127,9 @@ def fit(
         operator.set_branches(data.train_rows.types.branch)
     watch = ClosedLoopValidation(folder, settings.validate_every, dt=settings.dt, stop=settings.stop_when_safe)
     watch.begin(safe_sets(data.held_out()) if validation is None else validation, later)
-    trainer = make_trainer(settings, folder, loggers, [watch, *callbacks], validates=data.val_rows is not None)
+    plan = data.labels
+    adding = AdaptiveLabels(settings.adaptive, settings.steps, data.seed, settings.dt, plan.solver, plan.workers)
+    trainer = make_trainer(settings, folder, loggers, [adding, watch, *callbacks], validates=data.val_rows is not None)
     began = time.perf_counter()
     trainer.fit(module, datamodule=data, ckpt_path=resume, weights_only=True)
     if settings.polish:
@@ -131,13 +138,15 @@ def fit(
         watch.consider(trainer, module)
     # The callback saves at multiples of `validate_every`, which the last step need not be.
     trainer.save_checkpoint(folder / LAST, weights_only=False)
-    seconds = {"training": time.perf_counter() - began - watch.seconds, "validation": watch.seconds}
+    added = sum(found.seconds for found in adding.done)
+    training = time.perf_counter() - began - watch.seconds - added
+    seconds = {"training": training, "validation": watch.seconds, "added_labels": added}
     logged = {name: float(value) for name, value in trainer.callback_metrics.items() if name.startswith("loss/")}
     metrics = {name: loss for name, loss in logged.items() if not math.isnan(loss)}
     if data.val_rows is not None:
         metrics |= trainer.validate(module, datamodule=data, verbose=False)[0]
     checkpoint = folder / (LAST if watch.best is None else BEST)  # a best one of another run does not count
-    return Fitted(trainer, checkpoint, metrics, watch.best, seconds)
+    return Fitted(trainer, checkpoint, metrics, watch.best, adding.done, seconds)
 
 
 def make_trainer(

@@ -12,8 +12,8 @@ from torchmetrics import WeightedMeanAbsolutePercentageError
 
 from hno.losses import Objective, View
 from hno.operators.base import FieldFunction, ValueOperator
-from hno.operators.inputs import distinct_types, tables
-from hno.types import Batch, Field, Points, PotentialField, Sample
+from hno.operators.inputs import distinct_types
+from hno.types import Batch, Field, Points, PotentialField, Sample, tables
 
 Optimizer = Callable[[Iterable[nn.Parameter]], Mapping[str, Any]]
 """Builds what Lightning's `configure_optimizers` returns."""
