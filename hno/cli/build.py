@@ -19,6 +19,7 @@ from hno.games import Game, make
 from hno.games.grid import parse_types
 from hno.losses import Objective, make_objective
 from hno.operators import Architecture, Choice, ValueOperator, make_operator
+from hno.training.adaptive import Adaptive
 from hno.training.checkpoint import find_checkpoint
 from hno.training.fit import LAST, Settings
 from hno.training.optimizers import make_optimizer
@@ -102,5 +103,6 @@ def how_to_train(settings: TrainSettings) -> Settings:
         optimizer=settings.optimizer,
         stop_when_safe=settings.validation.stop_when_safe,
         dt=settings.evaluation.dt,
+        adaptive=Adaptive(**settings.data.adaptive.model_dump()),
         **shared,
     )

@@ -37,11 +37,20 @@ class BatchSizes(Settings):
     terminal: Size | None
 
 
+class AdaptiveSettings(Settings):
+    """Labels that are added while training."""
+
+    rounds: Count
+    labels: Size
+    candidates: Size
+
+
 class DataSettings(Settings):
     """Labels and the curriculum."""
 
     types: Loose | None
     widen: Annotated[list[Positive], Field(min_length=1)]
+    adaptive: AdaptiveSettings
     trajectories: Size
     validation: Size
     batch_sizes: BatchSizes

@@ -96,6 +96,9 @@ def train_operator(settings: TrainSettings, folder: Path, results: Results) -> F
     solving = results.content["seconds"].get("validation_labels", 0.0) - before  # while validation played
     results.time("training", fitted.seconds["training"])
     results.time("validation", fitted.seconds["validation"] - solving)
+    if fitted.rounds:
+        results.time("added_labels", fitted.seconds["added_labels"])
+        results.update(rounds=[found._asdict() for found in fitted.rounds])
     results.update(
         steps=fitted.trainer.global_step,
         checkpoint=fitted.checkpoint.name,
