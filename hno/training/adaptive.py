@@ -196,8 +196,8 @@ def candidates(
     disturbed = plan.disturbance._replace(seed=seed)
     path = rollout(policy.game, policy, x[keep].to(like), theta[keep].to(like), dt, disturbance=disturbed)
     for number, share in enumerate(plan.shares):
-        tau = max(1, round(share * game.horizon / game.label_step)) * game.label_step
-        node = round((game.horizon - tau) / dt)
+        left = max(1, round(share * game.horizon / dt))
+        tau, node = left * dt, round(game.horizon / dt) - left
         now, theirs = path.x[number :: len(plan.shares), node].cpu().float(), theta[keep][number :: len(plan.shares)]
         sound = now.isfinite().flatten(1).all(-1)
         now, theirs = now[sound], theirs[sound]

@@ -75,7 +75,7 @@ class Fitted(NamedTuple):
     rounds: list[Round]
     """What was labelled while training."""
     seconds: dict[str, float]
-    """Time spent on training, on validation and on labels that were added, s."""
+    """Time spent on training, on validation and on labels that were added, if any, s."""
 
 
 def fit(
@@ -140,7 +140,7 @@ def fit(
     trainer.save_checkpoint(folder / LAST, weights_only=False)
     added = sum(found.seconds for found in adding.done)
     training = time.perf_counter() - began - watch.seconds - added
-    seconds = {"training": training, "validation": watch.seconds, "added_labels": added}
+    seconds = {"training": training, "validation": watch.seconds} | ({"added_labels": added} if adding.done else {})
     logged = {name: float(value) for name, value in trainer.callback_metrics.items() if name.startswith("loss/")}
     metrics = {name: loss for name, loss in logged.items() if not math.isnan(loss)}
     if data.val_rows is not None:
