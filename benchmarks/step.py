@@ -28,7 +28,7 @@ from hno.operators.inputs import ego_views
 from hno.training.module import TrainingModule
 from hno.types import Batch, Field, Labels, Points, Sample, Types
 
-ARCHITECTURE = Architecture(Choice("gradient", {"exact_terminal": False}), activation=Choice("tanh"))
+ARCHITECTURE = Architecture(Choice("value", {"exact_terminal": False}), activation=Choice("tanh"))
 """The paper's."""
 WEIGHTS = {"value": 1.0, "costate": 1.0, "boundary": 1.0, "residual": 1.0}
 TYPES = torch.tensor([[1.0, 1], [1, 5], [5, 1], [5, 5], [1, 3], [3, 3], [3, 5]])
@@ -99,7 +99,7 @@ def residual(operator: ValueOperator, name: str, sample: Sample, field: Field) -
     """Scaled residual of one term for some rows."""
     game, scales, points = operator.game, operator.scales, sample.points
     if name == "residual":
-        view = View(game, sample, field, lambda at: published_field(operator, at), scales, 0)
+        view = View(game, operator.problem, sample, field, lambda at: published_field(operator, at), scales, 0)
         return hji_residual(game, points, field) / HJIResidual().scale(view)
     if name == "boundary":
         return (field.value - game.terminal_value(points.x)) / scales.value

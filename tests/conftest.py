@@ -12,9 +12,11 @@ from hno.games import make
 from hno.types import Extremal
 
 TRAIN = Request((1.0, 1.0), 4, 0, "train")
-"""Labels that every test shares: those of `experiment=smoke data.types=[[1,1]]`."""
+"""Labels that every test shares."""
+SMOKE = TRAIN._replace(all_equilibria=True)
+"""Those of `experiment=smoke data.types=[[1,1]]`, which learns a potential."""
 TEST = Request((1.0, 1.0), 4, 1000, "test")
-"""Test starts of the same configuration."""
+"""Test starts of that configuration."""
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -44,7 +44,7 @@ class Axolotl:
 """
 GROUPS = {
     "game": "hno.games",
-    "function": "hno.operators",
+    "function": "hno.functions",
     "network": "hno.networks",
     "activation": "hno.activations",
     "loss": "hno.losses",
@@ -270,7 +270,7 @@ def test_classes_know_their_names(animals):
     ("module", "name", "known"),
     [
         ("hno.games", "games", {"drone", "lane_change", "narrow_road"}),
-        ("hno.losses", "losses", {"boundary", "costate", "residual", "value"}),
+        ("hno.losses", "losses", {"boundary", "branches", "costate", "residual", "value"}),
         ("hno.operators", "functions", {"potential", "value"}),
         ("hno.operators", "networks", {"deeponet"}),
         ("hno.operators", "activations", {"relu", "sin", "tanh"}),
@@ -304,7 +304,7 @@ def test_an_unknown_option_comes_with_the_known_ones_and_the_nearest():
 
 @pytest.mark.parametrize(
     ("part", "options"),
-    [("operator", ("game", "network")), ("network", ("inputs", "activation")), ("activation", ())],
+    [("function", ("game", "network")), ("network", ("inputs", "activation")), ("activation", ())],
 )
 def test_an_operator_refuses_options_that_its_parts_do_not_know(part, options):
     for option in ("widht", *options):

@@ -32,12 +32,12 @@ class GrowingResidual(LossTerm):
         self.steps = steps
 
     def residual(self, view: View) -> Tensor:
-        """(B, P), 1/s."""
+        """(B, P), or (B, 1) of a potential, 1/s."""
         share = min(1.0, (view.step + 1) / self.steps)
-        return share * hji_residual(view.game, view.sample.points, view.field)
+        return share * hji_residual(view.problem, view.sample.points, view.field)
 
     def scale(self, view: View) -> Tensor:
-        """Size of values per horizon, and the cost of the state where that is larger, (B, P)."""
+        """Size of values per horizon, and the cost of the state where that is larger, as `residual`."""
         points = view.sample.points
-        cost = view.game.uncontrolled_cost(points.x, points.theta).abs()
+        cost = view.problem.uncontrolled_cost(points.x, points.theta).abs()
         return cost.maximum(view.scales.value / view.game.horizon)

@@ -11,7 +11,7 @@ from hno.data.labels import label_set
 from hno.games import make
 from hno.types import Extremal
 from tests.cli.conftest import SMOKE, Command, refused
-from tests.conftest import TEST, TRAIN
+from tests import conftest as shared
 
 
 @pytest.mark.usefixtures("no_labels")
@@ -31,7 +31,8 @@ from tests.conftest import TEST, TRAIN
         ("network.name=deepnet", "'deeponet'"),
         ("network.widht=8", "'width'"),
         ("activation.frequenzy=3", "'frequency'"),
-        ("operator.member=3", "'members'"),
+        ("operator.nmae=hno", "'name'"),
+        ("function=value function.member=3", "'members'"),
         ("optimizer.weight_decai=0.1", "'weight_decay'"),
         ("sampler.bond=0.1", "'band'"),
         ("sampler.band.raech=0.1", "'reach'"),
@@ -51,7 +52,7 @@ from tests.conftest import TEST, TRAIN
     ],
 )
 def test_unknown_names_are_answered_with_the_list_and_the_nearest(command: Command, override: str, near: str) -> None:
-    refused(command("train", *SMOKE, override), "Known: ", f"Did you mean {near}?")
+    refused(command("train", *SMOKE, *override.split()), "Known: ", f"Did you mean {near}?")
 
 
 @pytest.mark.usefixtures("no_labels")
@@ -98,9 +99,9 @@ def test_types_inside_the_range_warn_of_nothing(command: Command) -> None:
             "network.depth", "data.validation", "data.workers", "trainer.validate_every", "trainer.print_every",
             "trainer.threads", "optimizer.lr",
         )),
-        *((f"+function.members={number}", "function.members must be an odd whole number, such as 1 or 3")
+        *((f"function=value function.members={number}", "function.members must be an odd whole number, such as 1 or 3")
           for number in ("0", "2")),
-        *((f"+function.members={number}", "function.members must be a valid integer")
+        *((f"function=value function.members={number}", "function.members must be a valid integer")
           for number in ("1.5", "true", "null", "three")),
         ("function.exact_terminal=1", "function.exact_terminal must be a valid boolean"),
         ("data.batch_sizes.bvp=0", "data.batch_sizes.bvp must be greater than or equal to 1; got 0"),
@@ -126,7 +127,7 @@ def test_types_inside_the_range_warn_of_nothing(command: Command) -> None:
     ],
 )  # fmt: skip
 def test_impossible_numbers(command: Command, override: str, message: str) -> None:
-    run = command("train", *SMOKE, override)
+    run = command("train", *SMOKE, *override.split())
     refused(run, message)
     assert not run.folder.exists()
 
@@ -140,7 +141,11 @@ def test_every_mistake_is_named_at_once(command: Command) -> None:
 @pytest.mark.usefixtures("no_labels")
 def test_weights_and_terms_belong_together(command: Command) -> None:
     both = "Every loss term needs a weight and every weight a term; got the terms"
-    refused(command("train", *SMOKE, "operator=sno", "loss.weights.residual=0.1"), both, "weights of costate, residual")
+    refused(
+        command("train", *SMOKE, "operator=sno", "loss.weights.residual=0.1"),
+        both,
+        "weights of branches, costate, residual",
+    )
     refused(command("train", *SMOKE, "loss.weights.residual=null"), both)
     refused(command("train", *SMOKE, "loss.terms.residual=null"), both)
     dry = command("train", *SMOKE, "loss.terms.residual=null", "loss.weights.residual=null", "--dry-run")
@@ -164,7 +169,7 @@ def test_unwritable_label_folder(command: Command) -> None:
 @pytest.fixture
 def own_cache(labels: Callable[..., Extremal], tmp_path: Path) -> Path:
     """A copy of the labels that a smoke run needs."""
-    for request in (TRAIN, TEST):
+    for request in (shared.SMOKE, shared.TEST):
         own = label_set(make("narrow_road"), request, tmp_path / "labels")
         own.append(0, 0, labels("narrow_road", request))
         own.write_manifest()
@@ -210,7 +215,7 @@ def test_resuming_from_something_else(command: Command, tmp_path: Path, random_c
 
 
 def test_every_label_failed(command: Command, monkeypatch: pytest.MonkeyPatch, labels: Callable[..., Extremal]) -> None:
-    found = labels("narrow_road", TRAIN)
+    found = labels("narrow_road", shared.SMOKE)
     stalled = found._replace(status=torch.ones_like(found.status))
     monkeypatch.setattr(datamodule, "labels_for", lambda *arguments: ([stalled], 0.0))
     run = command("train", *SMOKE)

@@ -22,7 +22,7 @@ TINY = {
 @pytest.mark.usefixtures("cache", "clean_globals")
 def test_training_and_evaluation_as_calls(tmp_path: Path) -> None:
     policy = hno.train("narrow_road", "hno", tmp_path / "run", {**TINY, "activation": "tanh"})
-    assert policy.names() == {"game": "narrow_road", "operator": "hno", "activation": "tanh"}
+    assert policy.names() == {"game": "narrow_road", "operator": "hno", "function": "potential", "activation": "tanh"}
     tau, theta = torch.tensor([3.0]), torch.ones(1, 2)
     x = policy.game.initial_box.sample(1, torch.Generator().manual_seed(0))
     assert policy.value(tau, x, theta).shape == (1, 2)
@@ -57,4 +57,4 @@ def test_a_training_prints_nothing(tmp_path: Path) -> None:
 def test_a_method_that_does_not_exist_is_answered_with_the_methods(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"^No method named 'hmo'\. Known: hno, sno.* Did you mean 'hno'\?$") as error:
         hno.train("narrow_road", "hmo", tmp_path, TINY)
-    assert "gradient" not in str(error.value)
+    assert "potential" not in str(error.value)

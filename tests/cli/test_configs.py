@@ -57,7 +57,7 @@ def test_the_groups_of_the_configuration_are_folders() -> None:
 @pytest.mark.parametrize(("game", "operator"), list(product(GAMES, OPERATORS)))
 def test_every_experiment_builds_for_every_game_and_operator(experiment: str, game: str, operator: str) -> None:
     chosen = settings(f"experiment={experiment}", f"game={game}", f"operator={operator}")
-    needed = {"sno": {"bvp"}, "hno": STREAMS - ({"terminal"} if chosen.operator["exact_terminal"] else set())}
+    needed = {"sno": {"bvp"}, "hno": STREAMS - ({"terminal"} if chosen.function["exact_terminal"] else set())}
     assert data_of(chosen).streams == needed[operator]
 
 
@@ -65,7 +65,7 @@ def test_every_experiment_builds_for_every_game_and_operator(experiment: str, ga
     ("overrides", "members"), [((), 3), (("experiment=paper_grid",), 1), (("function.members=5",), 5)]
 )
 def test_the_drone_is_a_median_of_nets_unless_asked_otherwise(overrides: tuple[str, ...], members: int) -> None:
-    assert settings("game=drone", *overrides).operator["members"] == members
+    assert settings("game=drone", "function=value", *overrides).function["members"] == members
 
 
 @pytest.mark.parametrize(
@@ -98,15 +98,16 @@ def test_physics_stays_out_of_the_configuration() -> None:
 
 
 def options(chosen: TrainSettings) -> dict[str, Any]:
-    return {"sampler": chosen.sampler, "loss": chosen.loss.terms, "operator": chosen.operator}
+    return {"sampler": chosen.sampler, "loss": chosen.loss.terms, "function": chosen.function}
 
 
 def test_every_option_of_what_is_registered_is_in_the_settings() -> None:
     found = options(settings("operator=hno", "sampler.band=0.5", "sampler.rollout.spread=0.1"))
     assert found["sampler"]["band"] == {"share": 0.5, "reach": 1.5}
     assert found["sampler"]["rollout"] == {"share": 0.0, "spread": 0.1}
-    assert found["operator"] == {"name": "hno", "function": "gradient", "exact_terminal": True, "members": 1}
-    assert set(found["loss"]) == {"value", "costate", "boundary", "residual"}
+    assert found["function"] == {"name": "potential", "exact_terminal": True}
+    assert set(found["loss"]) == {"value", "costate", "branches", "boundary", "residual"}
+    assert settings("function=value").function == {"name": "value", "exact_terminal": True, "members": 1}
 
 
 def test_any_key_may_be_written_with_or_without_a_plus() -> None:
@@ -169,6 +170,7 @@ def test_hash_names_what_determines_the_numbers() -> None:
         "seed=1",
         "game=drone",
         "operator=hno",
+        "function=value",
         "activation=tanh",
         "optimizer.lr=1e-4",
         "data.trajectories=8",

@@ -137,7 +137,7 @@ def test_cache_is_that_of_the_environment_by_default(
         ({"game": "narow_road"}, "Did you mean 'narrow_road'?"),
         *(({name: None}, f"{name} is missing") for name in ("theta", "n")),
         ({"starts": "5"}, "starts does not exist"),
-        ({"function.members": "1"}, "operator does not exist"),
+        ({"function.members": "1"}, "function does not exist"),
         *(({"n": n}, "n must be a valid integer") for n in ("1.5", "many", "null", "true")),
         *(({name: "0"}, f"{name} must be greater than or equal to 1; got 0") for name in ("n", "workers")),
         ({"seed": "-1"}, "seed must be greater than or equal to 0; got -1"),
@@ -193,7 +193,7 @@ def test_to_is_the_folder_of_label_sets(generate: Generate, tmp_path: Path) -> N
 def test_failed_rows_are_counted_and_their_advice_printed(generate: Generate, monkeypatch: pytest.MonkeyPatch) -> None:
     status = torch.tensor([Status.CONVERGED, Status.STALLED, Status.STALLED, Status.NOT_FINITE, Status.CONVERGED])
 
-    def failing(game: Game, x0: Tensor, theta: Tensor, settings: Solver) -> Extremal:
+    def failing(game: Game, x0: Tensor, theta: Tensor, settings: Solver, *, all_equilibria: bool) -> Extremal:
         return fake_solve(game, x0, theta)._replace(status=status)
 
     monkeypatch.setattr(label_data, "solve", failing)
@@ -235,10 +235,10 @@ def test_finished_shards_survive_an_accident(
 ) -> None:
     solver = label_data.solve
 
-    def interrupted(game: Game, x0: Tensor, theta: Tensor, settings: Solver) -> Extremal:
+    def interrupted(game: Game, x0: Tensor, theta: Tensor, settings: Solver, *, all_equilibria: bool) -> Extremal:
         if asked.total() >= 2 * SHARD:
             raise accident
-        return solver(game, x0, theta, settings)
+        return solver(game, x0, theta, settings, all_equilibria=all_equilibria)
 
     with monkeypatch.context() as patch:
         patch.setattr(label_data, "solve", interrupted)

@@ -70,10 +70,20 @@ def test_help_shows_groups_that_can_be_chosen_and_keys_with_their_comments(
     assert main(["train", "game=drone", "--help"]) == 0
     printed = capsys.readouterr().out
     groups = printed[printed.index("Groups") : printed.index("Keys")]
-    for part in ("*drone ", " narrow_road ", "*sno ", " hno ", "*soap ", "*deeponet ", " fast "):
+    for part in (
+        "*drone ",
+        " narrow_road ",
+        "*sno ",
+        " hno ",
+        "*soap ",
+        "*auto ",
+        " potential ",
+        "*deeponet ",
+        " fast ",
+    ):
         assert part in groups
     keys = yaml.safe_load(printed[printed.index("\n", printed.index("Keys")) :])
-    assert keys["operator"]["members"] == 3
+    assert keys["function"]["members"] == 3
     (line,) = [line for line in printed.splitlines() if "precondition_frequency" in line or "pretrain:" in line][:1]
     assert "# share of the steps that are supervised only" in line
 

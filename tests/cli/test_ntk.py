@@ -38,7 +38,9 @@ def test_the_kernel_at_training_types_is_in_the_results(command: Command, random
 
 
 def test_training_can_end_with_the_kernel(command: Command) -> None:
-    run = command("train", *SMOKE, "trainer.max_steps=1", "evaluation.ntk=true", "evaluation.ntk_rows=40")
+    run = command(
+        "train", *SMOKE, "function=value", "trainer.max_steps=1", "evaluation.ntk=true", "evaluation.ntk_rows=40"
+    )
     assert run.code == 0, run.text
     assert [(entry["theta"], entry["kernel"]["rows"]) for entry in run.results["ntk"]] == [([1, 1], 40)]
     assert "Neural tangent kernel" in run.text
@@ -48,13 +50,17 @@ def test_training_can_end_with_the_kernel(command: Command) -> None:
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("evaluation.ntk_rows=19", "must be"),
+        ("function=value evaluation.ntk_rows=19", "must be"),
         ("evaluation.ntk=maybe", "must be"),
-        ("function.members=3", "ntk=true is for one net, this operator has 3. Train it with function.members=1"),
+        (
+            "function=value function.members=3",
+            "ntk=true is for one net, this operator has 3. Train it with function.members=1",
+        ),
+        ("function=potential", "ntk=true is for the players' values, which function=value learns"),
     ],
 )
 def test_a_training_that_cannot_is_refused_before_it_begins(command: Command, override: str, message: str) -> None:
-    refused(command("train", *SMOKE, "evaluation.ntk=true", override), message)
+    refused(command("train", *SMOKE, "evaluation.ntk=true", *override.split()), message)
 
 
 def test_no_kernel_unless_asked_for(command: Command, random_checkpoint: Path) -> None:

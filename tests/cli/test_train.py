@@ -20,6 +20,7 @@ from hno.data.labels import Request
 from hno.evaluation import outcome
 from hno.evaluation.closed_loop import TypeRow
 from hno.games import Game
+from hno.operators.deeponet import DeepONet
 from hno.training import validation
 from hno.training.divergence import StopOnDivergence
 from hno.training.validation import Score, Starts
@@ -48,24 +49,29 @@ def losses(folder: Path) -> list[dict[str, str]]:
         return [row for row in csv.DictReader(file) if row.get("loss/total")]
 
 
-@pytest.mark.parametrize(("game", "operator", "activation"), list(itertools.product(GAMES, OPERATORS, ACTIVATIONS)))
-def test_five_steps(command: Command, game: str, operator: str, activation: str) -> None:
-    run = command(
-        "train", *SMOKE, f"game={game}", f"operator={operator}", f"activation={activation}", "trainer.max_steps=5"
-    )
+@pytest.mark.parametrize(
+    ("game", "operator", "activation", "function"),
+    [
+        *((*parts, "potential") for parts in itertools.product(GAMES, OPERATORS, ACTIVATIONS)),
+        *((game, "hno", "sin", "value") for game in GAMES),
+    ],
+)
+def test_five_steps(command: Command, game: str, operator: str, activation: str, function: str) -> None:
+    chosen = {"game": game, "operator": operator, "activation": activation, "function": function}
+    run = command("train", *SMOKE, *(f"{name}={part}" for name, part in chosen.items()), "trainer.max_steps=5")
     assert run.code == 0, run.text
     results = run.results
-    assert (results["game"], results["operator"], results["activation"]) == (game, operator, activation)
+    assert {name: results[name] for name in chosen} == chosen
     assert (results["status"], results["reason"], results["steps"]) == ("finished", None, 5)
     policy = hno.load_policy(run.folder / "last.ckpt")
     x = policy.game.initial_box.sample(3, torch.Generator().manual_seed(0))
     u = policy(torch.full((3,), policy.game.horizon), x, torch.full((3, 2), 2.5))
     assert u.shape == (3, 2, policy.game.control_dim)
     assert bool(u.isfinite().all())
-    members = policy.operator.networks
+    members = [part for part in policy.operator.modules() if isinstance(part, DeepONet)]
     slopes = [float(net.activation.slope) for member in members for net in (member.trunk, member.branch)]
     assert all(abs(slope - 0.1) > 1e-6 for slope in slopes)
-    assert len(set(slopes)) == len(slopes) == (6 if game == "drone" else 2)
+    assert len(set(slopes)) == len(slopes) == (6 if (game, function) == ("drone", "value") else 2)
 
 
 @pytest.mark.parametrize(("finish", "hybrid"), [(0, [2, 3, 4]), (0.4, [2]), (1, [])])

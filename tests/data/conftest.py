@@ -30,7 +30,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> Asked:
     """A solver that answers at once, and how many rows of each type were asked of it."""
     count: Asked = Counter()
 
-    def answer(game: Game, x0: Tensor, theta: Tensor, settings: Solver) -> Extremal:
+    def answer(game: Game, x0: Tensor, theta: Tensor, settings: Solver, *, all_equilibria: bool) -> Extremal:
         count[tuple(theta[0].tolist())] += len(x0)
         return fake_solve(game, x0, theta)
 

@@ -134,15 +134,12 @@ def test_cache_folder_comes_from_the_environment(monkeypatch: pytest.MonkeyPatch
     assert default_cache() == Path.home() / ".cache" / "hno"
 
 
-Solve = Callable[[Game, Tensor, Tensor, Solver], Extremal]
-
-
 @pytest.fixture
 def calls(monkeypatch: pytest.MonkeyPatch) -> list[tuple[float, ...]]:
     """The types that were asked of a solver that answers at once; it fails for theta = (9, 9)."""
     asked: list[tuple[float, ...]] = []
 
-    def answer(game: Game, x0: Tensor, theta: Tensor, settings: Solver) -> Extremal:
+    def answer(game: Game, x0: Tensor, theta: Tensor, settings: Solver, *, all_equilibria: bool) -> Extremal:
         asked.append(tuple(theta[0].tolist()))
         if asked[-1] == (9.0, 9.0):
             raise RuntimeError("power cut")
@@ -183,7 +180,7 @@ def test_progress_counts_the_rows_that_are_solved(tmp_path: Path, asked: Asked) 
 
 
 def test_progress_tells_converged_rows_from_failed_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def every_other(game: Game, x0: Tensor, theta: Tensor, settings: Solver) -> Extremal:
+    def every_other(game: Game, x0: Tensor, theta: Tensor, settings: Solver, *, all_equilibria: bool) -> Extremal:
         return fake_solve(game, x0, theta)._replace(status=torch.arange(len(x0)) % 2)
 
     monkeypatch.setattr(label_data, "solve", every_other)

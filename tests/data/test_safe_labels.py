@@ -36,7 +36,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> Asked:
     calls: Asked = []
     shares = {(1.0, 5.0): 0.4, (5.0, 5.0): 0.08, (3.0, 3.0): 0.0, (2.0, 2.0): 1.0}
 
-    def answer(game: Game, x0: Tensor, theta: Tensor, settings: Solver) -> Extremal:
+    def answer(game: Game, x0: Tensor, theta: Tensor, settings: Solver, *, all_equilibria: bool) -> Extremal:
         calls.append(x0)
         chance, share = draw(x0), shares[tuple(theta[0].tolist())]
         clearance = torch.where(chance < share, 2 * CLEARANCE, torch.where(chance < share + 0.1, CLEARANCE / 2, -0.1))

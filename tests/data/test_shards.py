@@ -14,7 +14,7 @@ from hno.data.labels import Request, label_set, labels_for, start_states
 from hno.data.shards import MANIFEST, SHARD, LabelSet
 from hno.data.store import LabelFileError, checksum
 from hno.games import make
-from hno.types import Extremal, part
+from hno.types import Extremal, of_starts
 from tests.data.conftest import Asked
 from tests.fakes import fake_solve
 
@@ -59,7 +59,7 @@ def bits(labels: Extremal) -> list[bytes]:
 def test_a_set_is_shards_and_a_manifest(fill: Fill) -> None:
     labels = fill()
     assert sorted(files(labels)) == [MANIFEST, *(f"shard-0000{shard}.safetensors" for shard in range(3))]
-    assert [labels.rows(shard) for shard in range(4)] == [SHARD, SHARD, 300 - 2 * SHARD, 0]
+    assert [labels.starts(shard) for shard in range(4)] == [SHARD, SHARD, 300 - 2 * SHARD, 0]
 
 
 def test_a_set_is_read_in_the_order_of_its_starts(fill: Fill) -> None:
@@ -70,7 +70,7 @@ def test_a_set_is_read_in_the_order_of_its_starts(fill: Fill) -> None:
 
 def test_more_rows_than_there_are_cannot_be_read(fill: Fill) -> None:
     labels = fill()
-    with pytest.raises(LabelFileError, match=r"shard-00002.* holds 44 rows, expected 45"):
+    with pytest.raises(LabelFileError, match=r"shard-00002.* holds 44 start states, expected 45"):
         labels.read(301)
 
 
@@ -99,7 +99,7 @@ def test_full_shards_are_not_written_again(fill: Fill) -> None:
 def test_a_partial_shard_in_the_middle_is_completed(fill: Fill, asked: Asked) -> None:
     labels = fill()
     before = files(labels)
-    short = part(labels.read_shard(1), slice(50))
+    short = of_starts(labels.read_shard(1), 0, 50)
     labels.path(1).unlink()
     labels.append(1, 0, short)
     asked.clear()
@@ -132,15 +132,15 @@ def test_a_request_before_a_missing_shard_is_answered(fill: Fill, asked: Asked) 
 def test_rows_that_two_processes_solved_are_kept_once(fill: Fill, tmp_path: Path) -> None:
     labels = fill(20)
     for count in (60, 40, 80):
-        labels.append(0, 20, part(rows(count), slice(20, None)))
+        labels.append(0, 20, of_starts(rows(count), 20))
     assert bits(labels.read_shard(0)) == bits(rows(80))
 
 
 def test_rows_are_not_added_behind_a_gap(fill: Fill) -> None:
     labels = fill(20)
     before = files(labels)
-    with pytest.raises(LabelFileError, match=r"shard-00000.* shrank from 30 to 20 rows"):
-        labels.append(0, 30, part(rows(40), slice(30, None)))
+    with pytest.raises(LabelFileError, match=r"shard-00000.* shrank from 30 to 20 start states"):
+        labels.append(0, 30, of_starts(rows(40), 30))
     assert files(labels) == before
 
 
@@ -187,7 +187,7 @@ def test_manifest_says_what_is_in_the_shards(fill: Fill) -> None:
     assert content["summary"] == summary(rows(300))
     assert content["versions"].keys() == {"hno", "torch"}
     assert content["shards"] == [
-        {"file": labels.path(shard).name, "rows": labels.rows(shard), "sha256": checksum(labels.path(shard))}
+        {"file": labels.path(shard).name, "rows": labels.starts(shard), "sha256": checksum(labels.path(shard))}
         for shard in range(3)
     ]
 
@@ -207,7 +207,7 @@ def test_a_missing_or_stale_manifest_is_written_again(fill: Fill, content: str |
 
 def test_manifest_follows_rows_that_were_added_without_it(fill: Fill) -> None:
     labels = fill(20)
-    labels.append(0, 20, part(rows(40), slice(20, None)))
+    labels.append(0, 20, of_starts(rows(40), 20))
     labels.write_manifest()
     assert [shard["rows"] for shard in manifest(labels)["shards"]] == [40]
     assert manifest(labels)["summary"] == summary(rows(40))

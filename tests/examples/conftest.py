@@ -26,9 +26,6 @@ LABELS = {"value": {}, "costate": {}}
 SMALL = Choice("deeponet", {"width": 32, "depth": 3})
 
 
-SMALL = Choice("deeponet", {"width": 32, "depth": 3})
-
-
 @pytest.fixture
 def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, dict[str, str]]:
     """The examples' package as `pip install ./examples` leaves it; its entry points by group.

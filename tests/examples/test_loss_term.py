@@ -9,7 +9,7 @@ import hno
 from hno.cli.arguments import parse
 from hno.cli.config import compose, for_hydra
 from hno.games import make
-from hno.losses import Scales, View, make_objective
+from hno.losses import View, make_objective
 from hno.operators import make_operator
 from hno.types import Points, Sample
 from tests.cli.conftest import SMOKE, Command
@@ -25,7 +25,7 @@ def view(step: int) -> View:
     operator = make_operator(game)
     x, theta = (box.sample(4, torch.Generator().manual_seed(0)) for box in (game.state_box, game.type_box))
     points = Points(torch.linspace(0, 3, 4), x, theta)
-    return View(game, game, Sample(points), operator.field(points), operator.field, Scales(*operator.scales), step)
+    return operator.view(Sample(points), operator.field(points), step=step)
 
 
 @pytest.mark.parametrize(("step", "share"), [(0, 0.1), (4, 0.5), (9, 1.0), (1000, 1.0)])
