@@ -8,7 +8,6 @@ from pydantic import BeforeValidator, Field
 
 from hno.cli import schema
 from hno.cli.schema import Amount, Count, Loose, Positive, Seed, Settings, Share, Size, Text
-from hno.games import games
 
 
 class GameSettings(Settings):
@@ -20,7 +19,8 @@ class GameSettings(Settings):
     @property
     def potential(self) -> bool:
         """Whether it is a potential game; not where it is unknown, which its first use says."""
-        return self.name in games.names() and games.get(self.name).potential
+        games = schema.REGISTRIES["game"]()
+        return self.name in games.names() and getattr(games.get(self.name), "potential", False)
 
 
 class Method(Settings):

@@ -7,7 +7,7 @@ from typing import Any
 
 from torch import Tensor
 
-from hno.types import Extremal, Status, part
+from hno.types import Extremal, Status, best_of, part
 
 LOCAL_GAP = 1e-4
 """Best-response gap from the equilibrium itself above which a label is doubtful, relative."""
@@ -33,14 +33,17 @@ def inevitable(found: Extremal) -> Tensor:
 
 
 def summary(found: Extremal) -> dict[str, Any]:
-    """Counts and worst certificates of a label set, JSON content; numbers that do not exist are None."""
-    solved = found.status == Status.CONVERGED
+    """Counts and worst certificates of a label set, JSON content; numbers that do not exist are None.
+
+    Starts are counted by their best equilibrium; certificates are those of all.
+    """
+    best, solved = best_of(found), found.status == Status.CONVERGED
     local, total = found.local_gap.amax(-1), found.global_gap.amax(-1)
     return {
-        "starts": len(found.status),
-        "status": {status.name.lower(): int((found.status == status).sum()) for status in Status},
-        "safe": int(safe(found).sum()),
-        "inevitable": int(inevitable(found).sum()),
+        "starts": len(best.status),
+        "status": {status.name.lower(): int((best.status == status).sum()) for status in Status},
+        "safe": int(safe(best).sum()),
+        "inevitable": int(inevitable(best).sum()),
         "largest_residual": _largest(found.residual[solved]),
         "largest_reintegration": _largest(found.reintegration[solved]),
         "largest_local_gap": _largest(local[solved]),

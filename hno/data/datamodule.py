@@ -92,9 +92,8 @@ class GameData(L.LightningDataModule):
         brought = [tuple(theta) for own in self.own for theta in own.theta.unique(dim=0).tolist()]
         self.type_list = list(dict.fromkeys([*solved, *brought]))
         self.types = torch.tensor(self.type_list)
-        shares = list(
-            zip(labels.widen, labels.shares(labels.trajectories), labels.shares(labels.validation), strict=True)
-        )
+        parts = labels.widen, labels.shares(labels.trajectories), labels.shares(labels.validation)
+        shares = [(widen, trained, kept) for widen, trained, kept in zip(*parts, strict=True) if trained + kept]
         self.requests = [
             Request(theta, trained + kept, seed, "train", widen, all_equilibria=potential)
             for theta in solved
@@ -192,8 +191,8 @@ class GameData(L.LightningDataModule):
         return self._joined[1:]
 
     def _split(self) -> Iterator[tuple[Extremal, int]]:
-        """Labels of every set, and how many of its start states are held out."""
-        return zip(self.extremals, self.kept, strict=True)
+        """Labels of every set, and how many of its start states are held out; none without labels."""
+        return zip(self.extremals, self.kept, strict=bool(self.extremals))
 
     def held_out(self) -> list[Extremal]:
         """The best labels of start states that are not trained on, one set per request; none without labels."""

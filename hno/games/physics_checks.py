@@ -204,9 +204,12 @@ def _check_signs(game: Game) -> None:
 def _check_potential(game: Game) -> None:
     if game.potential:
         gap = potential_gap(game)
-        expected = "a player's deviation to change its own running cost as much as potential_cost"
+        expected = "a player's deviation to change its own cost as much as the potential"
         got = f"a difference of {gap:.3g} of the cost"
-        remedy = "Override potential_cost, with what players share counted once, or set potential = False."
+        remedy = (
+            "Override potential_cost, with what players share counted once, and let no terminal_value depend on other "
+            "players, or set potential = False."
+        )
         require(gap <= GAP, expected, got, remedy)
 
 

@@ -81,7 +81,8 @@ def require_potential(game: Game) -> None:
         found = f"misses by {gap:.3g} of the cost" if game.potential else "does not say that it is one (`potential`)"
         raise ValueError(
             f"{type(game).__name__} {found}: in a potential game a player who deviates alone changes its own running "
-            "cost as much as `potential_cost`. State that method, or learn the players' values with function=value."
+            "cost as much as `potential_cost`, and its own reward at the end as much as the sum of all. State that "
+            "method, or learn the players' values with function=value."
         )
 
 

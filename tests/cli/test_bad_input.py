@@ -10,8 +10,8 @@ from hno.data import datamodule
 from hno.data.labels import label_set
 from hno.games import make
 from hno.types import Extremal
-from tests.cli.conftest import SMOKE, Command, refused
 from tests import conftest as shared
+from tests.cli.conftest import SMOKE, Command, refused
 
 
 @pytest.mark.usefixtures("no_labels")

@@ -17,7 +17,7 @@ Printed = pytest.CaptureFixture[str]
 def test_every_kind_is_listed_with_a_line_for_each_name(capsys: Printed) -> None:
     assert main(["list"]) == 0
     printed = capsys.readouterr().out
-    for name in ("drone", "hno", "value", "potential", "deeponet", "sin", "residual", "band", "soap"):
+    for name in ("drone", "hno", "potential", "deeponet", "sin", "residual", "band", "soap"):
         (line,) = [line for line in printed.splitlines() if line.startswith(f"  {name} ")]
         assert line.endswith("]")
         assert len(line.split()) > 3, "every name has a summary"

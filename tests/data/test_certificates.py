@@ -35,6 +35,16 @@ def test_summary_counts_every_start_once_by_status(found: Extremal) -> None:
     assert (counts["safe"], counts["inevitable"]) == (2, 2)
 
 
+def test_summary_counts_starts_by_their_best_equilibrium_and_certifies_all(found: Extremal) -> None:
+    """Rows 2 and 3 are other equilibria of the second start, rows 5 and 6 of the third."""
+    several = found._replace(start=torch.tensor([0, 1, 1, 1, 2, 2, 2]))
+    several.local_gap[3] = 0.25
+    counts = summary(several)
+    assert (counts["starts"], counts["status"]["converged"], counts["status"]["stalled"]) == (3, 3, 0)
+    assert (counts["safe"], counts["inevitable"]) == (2, 1)
+    assert (counts["largest_local_gap"], counts["above_local_gap"]) == (0.25, 1)
+
+
 def test_summary_takes_the_worst_of_converged_rows_and_of_all_players(found: Extremal) -> None:
     found.local_gap[1, 1], found.local_gap[5, 0] = 0.25, 9.0
     found.global_gap[2, 0], found.global_gap[6, 1] = 0.5, 9.0

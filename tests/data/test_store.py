@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 from collections.abc import Callable
@@ -11,9 +12,9 @@ import safetensors.torch
 import torch
 
 from hno.data import store
-from hno.data.store import LabelFileError, canonical_json, checksum, read_labels, write_labels
+from hno.data.store import LabelFileError, canonical_json, checksum, read_labels, start_count, write_labels
 from hno.games import make
-from hno.types import Extremal
+from hno.types import Extremal, join
 from tests.fakes import fake_labels
 
 PROVENANCE = {"game": "NarrowRoad", "request": {"theta": [1.0, 1.0], "count": 4}}
@@ -41,6 +42,42 @@ def test_round_trip_is_bit_exact(written: Path, labels: Extremal) -> None:
     read, provenance = read_labels(written)
     assert bits(read) == bits(labels)
     assert provenance == PROVENANCE
+
+
+def test_starts_are_counted_and_not_rows(tmp_path: Path, labels: Extremal) -> None:
+    path, several = tmp_path / "labels.safetensors", labels._replace(start=torch.tensor([0, 0, 1, 1]))
+    write_labels(path, several, PROVENANCE)
+    assert start_count(path) == read_labels(path)[0].starts == 2
+    assert bits(read_labels(path)[0]) == bits(several)
+
+
+def without(labels: Extremal, path: Path, *columns: str) -> None:
+    """A file as it was written before labels had those columns, by means of its own."""
+    tensors = {name: tensor for name, tensor in sorted(labels._asdict().items()) if name not in columns}
+    digest = hashlib.sha256()
+    for name, tensor in tensors.items():
+        digest.update(f"{name}:{tensor.dtype}:{tuple(tensor.shape)};".encode() + tensor.numpy().tobytes())
+    header = {"format": 2, "provenance": PROVENANCE, "sha256": digest.hexdigest()}
+    text = json.dumps(header, sort_keys=True, separators=(",", ":"))
+    safetensors.torch.save_file(tensors, path, metadata={"hno": text})
+
+
+def test_files_that_are_older_than_potentials_are_read(tmp_path: Path, labels: Extremal) -> None:
+    """Each of their rows belongs to a start of its own, and its potential is not known."""
+    path = tmp_path / "old.safetensors"
+    without(labels, path, "potential", "start")
+    read, provenance = read_labels(path)
+    assert (start_count(path), read.starts, provenance) == (4, 4, PROVENANCE)
+    known = labels._replace(potential=torch.full_like(labels.potential, torch.nan), start=torch.arange(4))
+    assert bits(read) == bits(known)
+    assert join([read, labels]).start.tolist() == list(range(8))
+
+
+def test_a_file_that_lacks_any_other_column_is_refused(tmp_path: Path, labels: Extremal) -> None:
+    path = tmp_path / "old.safetensors"
+    without(labels, path, "value")
+    with pytest.raises(LabelFileError, match=r"old\.safetensors"):
+        read_labels(path)
 
 
 def test_only_the_label_file_is_left(written: Path) -> None:

@@ -8,7 +8,9 @@ from torch import Tensor
 
 from hno.games import Box, CollisionAvoidance, ControlAffineGame, Game, make
 from hno.games.kinematics import distances, double_integrator_drift
+from hno.games.potential import GAP, potential_gap, require_potential
 from hno.games.testing import ContractError, check_game
+from tests.crossing import Crossing, Merging
 from tests.lq import random_game
 
 
@@ -250,6 +252,34 @@ class FrozenChannel(Encounter):
         self.control_box = Box([-1.0, 0.0], [1.0, 0.0])
 
 
+class PenaltyCountedTwice(Encounter):
+    potential = True
+
+    def potential_cost(self, x: Tensor, theta: Tensor) -> Tensor:
+        return self.penalty(x, theta).sum(-1)
+
+
+class PenaltyBorneAlone(Encounter):
+    potential, roles = True, (0, 1)
+
+    def penalty(self, x: Tensor, theta: Tensor) -> Tensor:
+        return super().penalty(x, theta) * torch.tensor([1.0, 0.0], dtype=x.dtype)
+
+
+class RewardOfCompany(Encounter):
+    potential = True
+
+    def terminal_value(self, x: Tensor) -> Tensor:
+        return super().terminal_value(x) - (x - x.flip(-2)).square().sum(-1)
+
+
+class RewardOfTheOther(Encounter):
+    potential = True
+
+    def terminal_value(self, x: Tensor) -> Tensor:
+        return super().terminal_value(x) - x[..., 0].square().flip(-1)
+
+
 @pytest.mark.parametrize("name", ["narrow_road", "lane_change", "drone"])
 def test_the_games_of_the_paper_keep_the_contract(name):
     check_game(make(name))
@@ -311,12 +341,59 @@ def test_a_plain_game_keeps_the_contract_and_is_left_alone():
         (OutsideStart, r"initial_box inside state_box; got .*-5.0.*Widen state_box"),
         (OddHorizon, r"a whole multiple of label_step; got horizon 2.1 s, label_step 0.25 s"),
         (OnePlayerBox, r"initial_box of shape \(2, 4\); got \(4,\).*one row per entry of `roles`"),
+        *(
+            (game, r"a player's deviation to change its own cost as much as the potential; got .*counted once")
+            for game in (PenaltyCountedTwice, PenaltyBorneAlone, RewardOfCompany, RewardOfTheOther)
+        ),
         (FrozenChannel, r"positive edges of control_box; got \[2.0, 0.0\]"),
     ],
 )
 def test_a_broken_promise_is_named_with_its_remedy(broken, message):
     with pytest.raises(ContractError, match=r"(?s)Expected .*" + message):
         check_game(broken())
+
+
+@pytest.mark.parametrize("broken", [PenaltyCountedTwice, PenaltyBorneAlone, RewardOfCompany, RewardOfTheOther])
+def test_a_game_that_is_no_potential_game_is_sound_unless_it_says_that_it_is_one(broken):
+    assert potential_gap(broken()) > 1e-3
+    with pytest.raises(ValueError, match=rf"{broken.__name__} misses by .* of the cost: .*function=value"):
+        require_potential(broken())
+    game = broken()
+    game.potential = False
+    check_game(game)
+
+
+class SharedOnce(PenaltyBorneAlone):
+    def potential_cost(self, x: Tensor, theta: Tensor) -> Tensor:
+        return self.penalty(x, theta)[..., 0]
+
+
+def test_a_penalty_of_one_player_alone_makes_no_potential():
+    """Also where it counts once: when the other deviates, its own cost stays and the potential changes."""
+    assert potential_gap(SharedOnce()) > 1e-3
+
+
+class Alone(Encounter):
+    potential, roles = True, (0, 1)
+
+    def penalty(self, x: Tensor, theta: Tensor) -> Tensor:
+        """For each player's distance from the origin."""
+        return self.soft_constraint(0.2 * theta - x[..., :2].square().sum(-1).add(1e-6).sqrt())
+
+    def potential_cost(self, x: Tensor, theta: Tensor) -> Tensor:
+        return self.penalty(x, theta).sum(-1)
+
+
+@pytest.mark.parametrize(
+    "game",
+    [*map(make, ("narrow_road", "lane_change", "drone", "intersection")), Merging(2), Merging(3), Crossing(3), Alone()],
+    ids=lambda game: type(game).__name__,
+)
+def test_what_players_share_counts_once_in_a_potential(game):
+    assert game.potential
+    assert potential_gap(game) < GAP
+    assert potential_gap(game.double()) < 1e-12
+    require_potential(game)
 
 
 def test_a_game_with_declared_roles_may_treat_players_differently():

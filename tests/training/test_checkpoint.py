@@ -15,7 +15,8 @@ import hno
 from hno.control import Feedback
 from hno.games import make
 from hno.games.base import ExtrapolationWarning
-from hno.operators import ValueOperator
+from hno.operators import Choice, ValueOperator
+from hno.operators import make_operator as built
 from hno.registry import UnknownNameError
 from hno.training.checkpoint import CheckpointError, Provenance, check_resumable, load_operator, read_checkpoint, record
 from hno.types import Field, Points, Types
@@ -65,7 +66,29 @@ def test_round_trip(make_operator: MakeOperator, save: Save, game: str) -> None:
     assert not any(weights.requires_grad for weights in loaded.parameters())
     policy = hno.load_policy(path)
     assert policy.types == [(1.0, 1.0), (1.0, 5.0)]
-    assert policy.names() == {"game": game, "operator": "hno", "activation": "tanh"}
+    assert policy.names() == {"game": game, "operator": "hno", "function": "value", "activation": "tanh"}
+
+
+def test_branches_that_are_played_travel_with_the_checkpoint(tmp_path: Path) -> None:
+    """A branch that no label has stays closed after loading, also where its W would be the largest."""
+    chosen = replace(architecture(), function=Choice("potential", {"exact_terminal": True}))
+    torch.manual_seed(0)
+    original = built(make("narrow_road"), chosen)
+    points = random_points(original.game, 32)
+    for closed in (None, 0, 1):
+        original.active.fill_(True)
+        if closed is not None:
+            original.set_branches(torch.tensor([1 - closed]))
+        weights = {f"operator.{name}": weight for name, weight in original.state_dict().items()}
+        torch.save(record(original.game, chosen, ORIGIN) | {"state_dict": weights}, tmp_path / "last.ckpt")
+        loaded, parts, _ = load_operator(tmp_path / "last.ckpt")
+        assert (parts, loaded.potential) == (chosen, True)
+        assert torch.equal(loaded.active, original.active)
+        assert all(map(torch.equal, loaded.field(points), original.field(points)))
+        policy = hno.load_policy(tmp_path / "last.ckpt")
+        assert policy.names()["function"] == "potential"
+        assert set(policy.branch(*points).tolist()) == {0, 1} - {closed}
+        assert torch.equal(policy.act(*points), Feedback(original).act(*points))
 
 
 def test_changed_constants_travel_with_the_checkpoint(make_operator: MakeOperator, tmp_path: Path) -> None:
@@ -153,7 +176,7 @@ def test_checkpoint_of_another_game(save: Save) -> None:
     assert "'narrow_road'" in message
 
 
-@pytest.mark.parametrize("part", ["operator", "network", "activation"])
+@pytest.mark.parametrize("part", ["function", "network", "activation"])
 def test_a_part_that_is_not_registered_here(save: Save, part: str) -> None:
     parts = asdict(architecture()) | {part: {"name": "elsewhere", "options": {}}}
     with pytest.raises(UnknownNameError, match=rf"No {part} named 'elsewhere'\. Known: "):
@@ -177,12 +200,12 @@ def test_weights_of_another_network(save: Save) -> None:
     assert "does not hold the weights" in refused(save(state_dict={}))
 
 
-@pytest.mark.parametrize("version", [1, 2, 99, None])
+@pytest.mark.parametrize("version", [1, 2, 3, 99, None])
 def test_another_format_is_one_clear_sentence(save: Save, version: int | None) -> None:
     """Format 2 is what the releases before wrote: an operator's own name, options and types."""
     older = {"format": version, "game": "narrow_road", "operator": "hno", "options": {"width": 64}, "seen_types": []}
     path = save(hno=older)
-    assert refused(path) == f"{path} has format {version}, this version of hno reads format 3: train it again."
+    assert refused(path) == f"{path} has format {version}, this version of hno reads format 4: train it again."
     assert "train it again" in refused(save(spec={"format": version}))
 
 
