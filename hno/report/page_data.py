@@ -55,7 +55,8 @@ def learning_curves(recipes: Iterable[Recipe], runs: Iterable[Run]) -> list[Row]
     names = {run.name: recipe.name for recipe in recipes for run in recipe.runs}
     return [
         {
-            **names_of(run), "run": run.name, "recipe": names.get(run.name, f"{run.operator} / {run.activation}"),
+            **names_of(run), "run": run.name,
+            "recipe": names.get(run.name, " / ".join((run.operator, run.function, run.activation))),
             "metrics": {name: _thinned(curve) for name, curve in sorted(run.curves.items())},
         }
         for run in runs

@@ -8,10 +8,12 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from hno.report.page import write_page
 from hno.report.runs import load
+from tests.report.folders import GRID5, make_results, write_run
 
 playwright = pytest.importorskip("playwright.sync_api", reason="needs the package playwright")
 CHROMIUM = shutil.which("chromium")
@@ -110,6 +112,22 @@ def test_filters_hide_what_does_not_match_and_live_in_the_address(browser):
     browser.until("document.querySelector('#matching').textContent === '20 runs'")
 
 
+def test_what_is_learned_is_a_filter_of_its_own(context, tmp_path):
+    for name in ("potential", "value"):
+        results = make_results("drone", "sno", "tanh", 0, np.random.default_rng(0), GRID5[:2], function=name)
+        write_run(tmp_path / name, results)
+    write_page(load(tmp_path), tmp_path / "report.html")
+    opened = Browser(context, (tmp_path / "report.html").as_uri())
+    assert [row[1] for row in opened.rows("recipes")] == ["sno / potential / tanh", "sno / value / tanh"]
+    opened.filter(function="value")
+    assert [row[0] for row in opened.rows("runs")] == ["value"]
+    assert [row[1] for row in opened.rows("recipes")] == ["sno / value / tanh"]
+    opened.page.reload()
+    assert [row[0] for row in opened.rows("runs")] == ["value"]
+    assert opened.said == []
+    opened.page.close()
+
+
 def test_a_seed_shows_single_runs_in_place_of_pooled_ones(browser):
     pooled = browser.page.locator(".map:visible").first.inner_text()
     browser.filter(seed="0", game="narrow_road")
@@ -122,7 +140,7 @@ def test_a_column_sorts_by_value_with_missing_numbers_last(browser):
     for order, sign in (("ascending", 1), ("descending", -1)):
         head.click()
         assert head.locator("..").get_attribute("aria-sort") == order
-        texts = [row[8] for row in browser.rows("runs")]
+        texts = [row[9] for row in browser.rows("runs")]
         numbers = [int(text.replace(",", "")) for text in texts if text != "n/a"]
         assert numbers == sorted(numbers, key=lambda number: sign * number)
         assert texts[-2:] == ["n/a", "n/a"]
