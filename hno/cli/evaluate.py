@@ -24,7 +24,7 @@ from hno.control.rollout import control_steps
 from hno.data.labels import Request, default_cache, labels_for, safe_labels_for
 from hno.evaluation.closed_loop import CollisionTable, play
 from hno.evaluation.comparison import PairedComparison, check_same_game
-from hno.evaluation.conditions import table_condition
+from hno.evaluation.conditions import TIES, table_condition
 from hno.evaluation.episodes import EPISODES, episodes
 from hno.evaluation.format import title
 from hno.evaluation.sections import Evaluation
@@ -35,8 +35,6 @@ from hno.types import Extremal
 
 log = logging.getLogger(__name__)
 
-TIES = 25
-"""Ties that are played per type, at most: finding one takes some twenty labels."""
 Types = tuple[float, ...]
 """One type per player."""
 Table = list[dict[str, Any]]

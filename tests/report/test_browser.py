@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 import time
@@ -13,7 +14,7 @@ import pytest
 
 from hno.report.page import write_page
 from hno.report.runs import load
-from tests.report.folders import GRID5, make_results, write_run
+from tests.report.folders import GRID5, make_episode, make_results, write_run
 
 playwright = pytest.importorskip("playwright.sync_api", reason="needs the package playwright")
 CHROMIUM = shutil.which("chromium")
@@ -179,6 +180,22 @@ def test_the_discs_move_and_turn_red_in_a_collision(browser):
     far, near = fills(0), fills(25)
     assert danger not in far
     assert near == [danger, danger]
+
+
+def test_the_clock_says_which_branch_is_played(context, tmp_path):
+    folder = write_run(tmp_path, make_results("drone", "sno", "tanh", 0, np.random.default_rng(0), GRID5[:1]))
+    entry = make_episode("drone", (1.0, 1.0), "worst", 0.3, frames=5)
+    episodes = [entry | {"branch": [0, 0, 1, 1, 1], "other_side": True}, entry | {"kind": "typical"}]
+    (folder / "episodes.json").write_text(json.dumps({"episodes": episodes}))
+    write_page(load(folder), tmp_path / "report.html")
+    opened = Browser(context, (tmp_path / "report.html").as_uri())
+    opened.until("document.querySelector('#clock').textContent === '1.50 s, branch 1'")
+    assert "Passes on the other side than the equilibrium." in opened.page.inner_text("#said")
+    opened.page.click("#next")
+    opened.until("document.querySelector('#clock').textContent === '1.50 s'")
+    assert "other side" not in opened.page.inner_text("#said")
+    assert opened.said == []
+    opened.page.close()
 
 
 def test_the_keyboard_reaches_everything(browser):
