@@ -16,7 +16,7 @@ from hno.cli import launch
 from hno.cli.arguments import Arguments
 from hno.cli.config import read
 from hno.cli.logs import label_progress, use_threads
-from hno.cli.media import draw_typical, title_of
+from hno.cli.media import draw_typical
 from hno.cli.results import Results, config_hash, write_json
 from hno.cli.sections import chosen_sections, run_sections
 from hno.cli.settings import Episodes, EvaluateSettings
@@ -24,8 +24,9 @@ from hno.control.rollout import control_steps
 from hno.data.labels import Request, default_cache, labels_for, safe_labels_for
 from hno.evaluation.closed_loop import CollisionTable, play
 from hno.evaluation.comparison import PairedComparison, check_same_game
-from hno.evaluation.conditions import table_condition
+from hno.evaluation.conditions import TIES, table_condition
 from hno.evaluation.episodes import EPISODES, episodes
+from hno.evaluation.format import title
 from hno.evaluation.sections import Evaluation
 from hno.games import Game
 from hno.games.grid import parse_types, quarter_types
@@ -34,8 +35,6 @@ from hno.types import Extremal
 
 log = logging.getLogger(__name__)
 
-TIES = 25
-"""Ties that are played per type, at most: finding one takes some twenty labels."""
 Types = tuple[float, ...]
 """One type per player."""
 Table = list[dict[str, Any]]
@@ -180,7 +179,7 @@ def play_starts(evaluation: Evaluation, results: Results) -> tuple[Evaluation, T
         conditions = {name: found.options[name] for name in ("clearance", "dt", "widen", "noise", "delay")}
         results.update(**conditions, test_seed=disturbance.seed, constraint_unit=game.constraint_unit)
         results.update(table=table, episodes=EPISODES)
-        draw_typical(kept["episodes"], folder / "rollout.png", title_of(results.content))
+        draw_typical(kept["episodes"], folder / "rollout.png", title(results.content))
     return found, table
 
 

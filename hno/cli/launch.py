@@ -23,7 +23,7 @@ from hno.cli.logs import finish_wandb, send_lightning_to_hydra
 from hno.cli.results import Results, recorded
 from hno.cli.sections import show
 from hno.cli.sweep import Job, show_jobs
-from hno.evaluation.format import counted
+from hno.evaluation.format import NAMES, counted
 from hno.registry import UnknownNameError
 from hno.training.checkpoint import CheckpointError
 
@@ -31,8 +31,6 @@ log = logging.getLogger(__name__)
 
 REFUSALS = (HydraException, CheckpointError, ValueError, LookupError)
 """What a configuration raises that makes no run."""
-NAMED = ("game", "operator", "activation")
-"""Groups that name a job in results.json."""
 QUIET = ("hydra/hydra_logging=disabled", "hydra/job_logging=disabled", "hydra.output_subdir=null")
 
 
@@ -108,7 +106,7 @@ def _jobs(task: Task, given: Arguments, many: bool, dry: bool) -> int:
 def _refuse(job: Job, error: Exception) -> None:
     """Leave the reason in the results of a job that is not run: it is no failure of the jobs after it."""
     chosen = HydraConfig.get().runtime.choices
-    results = Results(job.folder / "results.json", {group: chosen.get(group) for group in NAMED})
+    results = Results(job.folder / "results.json", {group: chosen.get(group) for group in NAMES})
     results.update(status="failed", reason=str(error))
     log.error("%s", error, exc_info=None if isinstance(error, REFUSALS) else error)
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from lightning.pytorch.loggers import Logger, TensorBoardLogger, WandbLogger
 
-from hno.evaluation.format import number
+from hno.evaluation.format import number, title
 from hno.evaluation.outcome import pooled
 
 log = logging.getLogger(__name__)
@@ -71,17 +71,16 @@ def draw(results: Mapping[str, Any], folder: Path, kinds: Collection[type[Logger
     Returns:
         Names and files of the pictures.
     """
-    title = title_of(results)
     made = {name: folder / f"{name}.png" for name in ("rollout", "worst_episode", "collision_map")}
     with _harmless():
         from hno.report.pictures import collision_map
 
         if WandbLogger in kinds and (worst := worst_episode(results, folder)):
             smallest = f"{number(worst['clearance'])} {results.get('constraint_unit', 'm')}".strip()
-            heading = f"{title}\nsmallest clearance, {smallest} at ({name_of(worst['theta'])})"
+            heading = f"{title(results)}\nsmallest clearance, {smallest} at ({name_of(worst['theta'])})"
             _draw_episode(worst, made["worst_episode"], heading)
         if {WandbLogger, TensorBoardLogger} & set(kinds):
-            collision_map(results["table"], made["collision_map"], title)
+            collision_map(results["table"], made["collision_map"], title(results))
     return {name: path for name, path in made.items() if path.exists()}
 
 
@@ -99,11 +98,6 @@ def _draw_episode(content: Mapping[str, Any], path: Path, title: str) -> None:
     from hno.report.pictures import rollout_picture
 
     rollout_picture(episode(content), path, title)
-
-
-def title_of(results: Mapping[str, Any]) -> str:
-    """What was evaluated, for pictures."""
-    return " / ".join(str(results.get(name, "n/a")) for name in ("game", "operator", "activation"))
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from hno.cli.results import Results
-from hno.evaluation.format import short_names
+from hno.evaluation.format import short_names, title
 from hno.evaluation.sections import Evaluation, ModelSection, sections
 
 WIDTH = 140
@@ -62,8 +62,8 @@ def show(results: Mapping[str, Any], folder: Path) -> None:
     models = results.get("models", [results])
     names = short_names([str(model["checkpoint"]) for model in models]) if len(models) > 1 else [""]
     for name, model in zip(names, models, strict=True):
-        parts = [str(model[key]) for key in ("game", "operator", "activation")]
-        show_section("table", model["table"], results, console, " / ".join([*parts, name] if name else parts))
+        above = " / ".join(filter(None, (title(model), name)))
+        show_section("table", model["table"], results, console, above)
         for key in sections.names():
             if key in model and key not in ("table", "comparison"):
                 show_section(key, model[key], results, console)

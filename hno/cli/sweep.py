@@ -15,10 +15,10 @@ from rich.console import Console
 from rich.table import Table
 
 from hno.cli import pages
-from hno.evaluation.format import counted, interval, percent, signed, types
+from hno.evaluation.format import NAMES, counted, interval, percent, signed, types
 from hno.evaluation.outcome import pooled
 
-NAMES = ("game", "operator", "activation", "seed")
+NAMED = (*NAMES, "seed")
 """Entries of results.json that name a job, in the order by which jobs are sorted."""
 WRAPPED = ("settings", "95 % interval", "worst type")
 """Columns that take several lines where the terminal is narrow."""
@@ -80,16 +80,16 @@ def show_jobs(jobs: Sequence[Job]) -> None:
 
 def _order(entry: tuple[Job, Mapping[str, Any]]) -> tuple[Any, ...]:
     job, found = entry
-    return *(str(found.get(name, "")) for name in NAMES[:3]), int(found.get("seed", 0)), job.number
+    return *(str(found.get(name, "")) for name in NAMES), int(found.get("seed", 0)), job.number
 
 
 def _cells(job: Job, found: Mapping[str, Any], shared: Collection[str]) -> dict[str, str]:
     """A job's line: its settings are those that not all jobs share and no other column shows."""
     whole, spent = pooled(found.get("table", ())), found.get("seconds", {}).values()
-    own = [entry for entry in job.settings if entry not in shared and entry.partition("=")[0] not in NAMES]
+    own = [entry for entry in job.settings if entry not in shared and entry.partition("=")[0] not in NAMED]
     return {
         "job": str(job.number),
-        **{name: str(found.get(name, "n/a")) for name in NAMES},
+        **{name: str(found.get(name, "n/a")) for name in NAMED},
         "settings": " ".join(own),
         "collisions": f"{whole.collisions} of {whole.safe_starts}" if whole.safe_starts else "n/a",
         "95 % interval": interval(whole.interval),

@@ -10,6 +10,9 @@ from hno.control.disturbance import Disturbance, pushed_states
 from hno.games import Game
 from hno.registry import unknown_name
 
+TIES = 25
+"""Ties that are played per type, at most: finding one takes some twenty labels."""
+
 
 class Condition(NamedTuple):
     """Where episodes begin, and what disturbs them."""

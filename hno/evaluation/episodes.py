@@ -9,16 +9,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from hno.data.branches import rotations
 from hno.data.certificates import safe
 from hno.evaluation.sections import Evaluation
 from hno.games import Game
 from hno.games.kinematics import separation
-from hno.types import Extremal, Trajectory
+from hno.types import Extremal, Points, PotentialField, Trajectory
 
 EPISODES = "episodes.json"
 """Name of their file inside a run's folder."""
 FRAMES = 50
 """An episode is kept at about so many times, and where players are closest."""
+TURN = 0.5
+"""Angle that two players must turn around each other, rad, before it counts which way they do so."""
 
 
 def episodes(evaluation: Evaluation) -> dict[str, Any]:
@@ -26,8 +29,8 @@ def episodes(evaluation: Evaluation) -> dict[str, Any]:
 
     Returns:
         JSON content: positions of all players over time, the distance below which it is a collision where the
-        constraint is one, the path of the equilibrium from the same start, costs. Types without a start that counts
-        are left out.
+        constraint is one, the branch of a potential that is played, the path of the equilibrium from the same start and
+        whether players pass on another side than there, costs. Types without a start that counts are left out.
     """
     game, played = evaluation.game, evaluation.played
     kept = []
@@ -36,14 +39,14 @@ def episodes(evaluation: Evaluation) -> dict[str, Any]:
         if len(counted):
             near = part.clearance[counted]
             chosen = {"worst": near.argmin(), "typical": near.argsort()[len(near) // 2]}  # NaN is the smallest
-            kept += [{"kind": kind, **_episode(game, part, found, int(counted[k]))} for kind, k in chosen.items()]
+            kept += [{"kind": kind, **_episode(evaluation, part, found, int(counted[k]))} for kind, k in chosen.items()]
     dimensions = game.positions(played[0].x[:1, 0]).shape[-1]
     units = {"players": game.players, "dimensions": dimensions, "constraint_unit": game.constraint_unit}
     return {**units, "episodes": kept}
 
 
-def _episode(game: Game, played: Trajectory, label: Extremal, row: int) -> dict[str, Any]:
-    theta = label.theta[row].to(played.x)
+def _episode(evaluation: Evaluation, played: Trajectory, label: Extremal, row: int) -> dict[str, Any]:
+    game, theta = evaluation.game, label.theta[row].to(played.x)
     violation = game.constraint(played.x[row], theta.expand(len(played.t), -1)).flatten(1).amax(-1)
     closest = int(violation.nan_to_num(-math.inf).argmax())
     frames = sorted({*range(0, len(played.t), math.ceil(len(played.t) / FRAMES)), closest})
@@ -58,9 +61,26 @@ def _episode(game: Game, played: Trajectory, label: Extremal, row: int) -> dict[
         "label_cost": _rounded(label.cost[row]),
         "t": _rounded(t),
         "positions": _rounded(places),
+        "branch": _branches(evaluation, Points(game.horizon - t, played.x[row, frames], theta.expand(len(t), -1))),
+        "other_side": _other_side(game, played.x[row], label.x[row]),
         "radius": None if apart is None else _rounded(violation[frames] + apart),
         "label_positions": _rounded(_at(t, label.t, game.positions(label.x[row].to(places)))),
     }
+
+
+def _branches(evaluation: Evaluation, points: Points) -> list[int] | None:
+    """The branch that is played at each point; None for an operator without branches."""
+    field = evaluation.policy.operator.field(points)
+    return field.branches.argmax(-1).tolist() if isinstance(field, PotentialField) else None
+
+
+def _other_side(game: Game, played: Tensor, label: Tensor) -> bool:
+    """Whether two players turn around each other another way than along the label, (K, P, n) and (L, P, n)."""
+    if game.players == 1:
+        return False
+    own, other = (rotations(game, x.double().cpu().unsqueeze(0)) for x in (played, label))
+    turned = torch.minimum(own.norm(dim=-1), other.norm(dim=-1)) > TURN
+    return bool((turned & ((own * other).sum(-1) < 0)).any())
 
 
 def _at(times: Tensor, t: Tensor, places: Tensor) -> Tensor:

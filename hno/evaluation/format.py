@@ -3,11 +3,19 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 NOT_AVAILABLE = "n/a"
 """What stands for a number that does not exist."""
+NAMES = ("game", "operator", "function", "activation")
+"""Entries of results.json that name what was trained."""
+
+
+def title(results: Mapping[str, Any]) -> str:
+    """What was trained, on one line; what results do not name is left out."""
+    return " / ".join(str(results[name]) for name in NAMES if name in results)
 
 
 def number(value: float | None, digits: int = 2) -> str:

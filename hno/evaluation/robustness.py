@@ -7,13 +7,18 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from hno.data.labels import interchangeable
-from hno.data.ties import TooFewTiesError
+from hno.data.ties import TIE, TooFewTiesError
 from hno.evaluation import format as text
 from hno.evaluation.closed_loop import play
-from hno.evaluation.conditions import Condition, read_conditions
+from hno.evaluation.conditions import TIES, Condition, read_conditions
 from hno.evaluation.outcome import outcomes, pooled
 from hno.evaluation.sections import COUNTS, Column, Evaluation, ModelSection, sections
 
+MEANING = {
+    "symmetric": "all players start in the same own state",
+    "ties": f"the two cheapest equilibria of every start cost the same within {100 * TIE:g} %; at most {TIES} per type",
+}
+"""What entries of a condition mean whose name does not say it."""
 log = logging.getLogger(__name__)
 
 
@@ -65,6 +70,11 @@ class Robustness(ModelSection):
             {**row, "worst": _worst(row["types"]), "excess": (row["median_excess_cost"], row["median_label_cost"])}
             for row in content
         ]
+
+    def remarks(self, content: Sequence[Mapping[str, Any]], results: Mapping[str, Any]) -> list[str]:
+        """What start states of a condition are where it is not the box alone."""
+        entries = ((row, entry) for row in content for entry in MEANING if row["condition"].get(entry))
+        return [f"Condition {row['name']}: {MEANING[entry]}." for row, entry in entries]
 
 
 def conditions_of(evaluation: Evaluation) -> list[Condition]:

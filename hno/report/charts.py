@@ -109,7 +109,8 @@ def encounter(
     """Players on their way, seen from above or from the side, in true proportion.
 
     The disc around a player has half the collision radius: discs that overlap are a collision. In view is what
-    surrounds the players at the frame, or the whole. The data must be named "frames", see `episode.frames`.
+    surrounds the players at the frame, or the whole. A diamond marks where another branch is played than before. The
+    data must be named "frames", see `episode.frames`.
     """
     params = [alt.param(name=name, value=value) for name, value in {"frame": frame, "follow": follow, **whole}.items()]
     params += [alt.param(name=name, expr=expression) for name, expression in _window(up).items()]
@@ -121,11 +122,14 @@ def encounter(
     color = alt.expr(f"{STRUCK} ? danger : scale('color', datum.player)")
     size, opacity = alt.expr("PI * pow(metre * datum.radius / 2, 2)"), alt.expr(f"{STRUCK} ? 0.5 : 0.22")
     discs = now.mark_point(fill=color, stroke=color, size=size, fillOpacity=opacity, opacity=1, clip=True)
+    another = "datum.frame > 0 && data('frames')[datum.frame - 1].branch !== datum.branch"
+    changes = played.mark_point(shape="diamond", filled=True, size=90, opacity=1, clip=True)
     trail = played.mark_line(strokeWidth=2.5, clip=True, strokeCap="round").transform_filter("datum.frame <= frame")
     return (
         alt.layer(
             expected.mark_line(strokeDash=[5, 4], strokeWidth=1.5, opacity=0.55, clip=True).encode(who, order),
             trail.encode(who, order),
+            changes.encode(who).transform_filter(f"datum.frame <= frame && {another}"),
             discs.transform_filter("datum.radius !== null"),
             now.mark_point(filled=True, size=30, opacity=1, clip=True).encode(who),
         )

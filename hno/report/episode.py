@@ -31,6 +31,10 @@ class Episode(BaseModel):
     """m, (F, P, d)."""
     radius: Array | None = None
     """Distance below which it is a collision, m, (F,); None where the constraint is no distance."""
+    branch: Array | None = None
+    """Branch of a potential that is played, (F,); None where there are none."""
+    other_side: bool = False
+    """Whether two players pass each other on another side than along the equilibrium."""
     label_positions: Array | None = None
     """Positions along the equilibrium from the same start, m, (F, P, d)."""
 
@@ -49,7 +53,7 @@ def episode(content: Any) -> Episode:
     found = Episode.model_validate(content)
     arrays = {name: value for name, value in found if isinstance(value, np.ndarray)}
     places = (*found.t.shape, *found.positions.shape[1:])
-    wanted = {"t": places[:1], "positions": places, "radius": places[:1], "label_positions": places}
+    wanted = {name: places if "positions" in name else places[:1] for name in arrays}
     shapes = {name: array.shape for name, array in arrays.items()}
     if len(places) != 3 or places[2] not in (2, 3) or any(shape != wanted[name] for name, shape in shapes.items()):
         raise ValueError(f"arrays have shapes {shapes}, expected (F,) or (F, P, 2 or 3)")
@@ -80,11 +84,11 @@ def closest(found: Episode) -> int:
 
 
 def frames(found: Episode) -> list[dict[str, Any]]:
-    """A row for every frame: frame, t (s), distance and radius (m, or None), and lists over players.
+    """A row for every frame: frame, t (s), distance and radius (m, or None), branch (or None), lists over players.
 
     The lists are x, y and, in space, z; label_x and so on along the equilibrium, if that is known.
     """
-    columns = {"t": found.t, "distance": distances(found), "radius": found.radius}
+    columns = {"t": found.t, "distance": distances(found), "radius": found.radius, "branch": found.branch}
     for prefix, path in (("", found.positions), ("label_", found.label_positions)):
         if path is not None:
             columns |= {f"{prefix}{axis}": path[..., i] for i, axis in enumerate("xyz"[: path.shape[2]])}

@@ -55,7 +55,8 @@ def learning_curves(recipes: Iterable[Recipe], runs: Iterable[Run]) -> list[Row]
     names = {run.name: recipe.name for recipe in recipes for run in recipe.runs}
     return [
         {
-            **names_of(run), "run": run.name, "recipe": names.get(run.name, f"{run.operator} / {run.activation}"),
+            **names_of(run), "run": run.name,
+            "recipe": names.get(run.name, " / ".join((run.operator, run.function, run.activation))),
             "metrics": {name: _thinned(curve) for name, curve in sorted(run.curves.items())},
         }
         for run in runs
@@ -81,10 +82,12 @@ def ranked(runs: Iterable[Run]) -> list[tuple[Run, Episode]]:
 def playable(run: Run, found: Episode) -> Row:
     """What the page's player gets of an episode."""
     title = f"{run.name} · {at(found.theta)} · {found.kind}{' · collision' if found.collided else ''}"
+    title += " · other side" * found.other_side
     costs = ["n/a" if value is None else f"{value:.1f}" for value in (found.cost, found.label_cost)]
     near = clearance(found, run.constraint_unit)
     said = f"{run.name}, types {at(found.theta)}, {found.kind}: {near}. "
     said += f"Joint cost {costs[0]}, the equilibrium's {costs[1]}."
+    said += " Passes on the other side than the equilibrium." * found.other_side
     views = {name: whole(found, up) for up, name in enumerate(("top", "side")[: found.positions.shape[2] - 1], start=1)}
     return {**names_of(run), "title": title, "said": said, "collided": found.collided, "closest": closest(found),
             "frames": frames(found), "whole": views}  # fmt: skip

@@ -148,16 +148,16 @@ def _plain(text: str) -> str:
 def ratio_table(runs: Sequence[Run]) -> Table:
     """Condition numbers of an activation over those of the others (the paper's table of activations), by type.
 
-    Only runs of one game, operator and seed are compared; several of one activation are told apart by their names.
+    Only runs of one game, operator, function and seed are compared; several of one activation have their names beside.
     """
-    groups: dict[tuple[str, str, str], list[Run]] = {}
+    groups: dict[tuple[str, ...], list[Run]] = {}
     for run in runs:
         if run.finished and run.entries.get("ntk"):
-            groups.setdefault((run.game, run.operator, plain(run.seed)), []).append(run)
+            groups.setdefault((run.game, run.operator, run.function, plain(run.seed)), []).append(run)
     rows = list[dict[str, Any]]()
     for key, same in sorted(groups.items()):
         known, counts = (
-            dict(zip(("game", "operator", "seed"), key, strict=True)),
+            dict(zip(("game", "operator", "function", "seed"), key, strict=True)),
             Counter(run.activation for run in same),
         )
         names = [run.activation + f" ({run.name})" * (counts[run.activation] > 1) for run in same]

@@ -19,6 +19,8 @@ IGNORED = ("seed", "resume", "cache", "workers", "data.cache", "data.workers", "
 """Settings that do not make another recipe."""
 SHOWN = 3
 """Differing settings that are named in a recipe's label."""
+Names = tuple[str, str, str, str]
+"""Game, operator, function and activation."""
 Comparable = tuple[str, str, frozenset[tuple[float, ...]]]
 """What recipes share whose numbers may be compared: game, changed constants and conditions of play, and types."""
 
@@ -68,6 +70,7 @@ class Recipe:
 
     game: str
     operator: str
+    function: str
     activation: str
     variant: str
     """Settings in which it differs from others of the same names; empty if there are none."""
@@ -80,8 +83,9 @@ class Recipe:
 
     @property
     def name(self) -> str:
-        """Operator, activation and what else is special."""
-        return " / ".join(filter(None, (self.operator, self.activation, self.variant)))
+        """Operator, function, if results name it, activation and what else is special."""
+        function = "" if self.function == NOT_AVAILABLE else self.function
+        return " / ".join(filter(None, (self.operator, function, self.activation, self.variant)))
 
     @property
     def seeds(self) -> str:
@@ -137,9 +141,9 @@ class Recipe:
 
 def recipes(runs: Sequence[Run]) -> list[Recipe]:
     """Group runs whose settings are equal but for the seed."""
-    groups: dict[tuple[str, str, str], dict[tuple[tuple[str, str], ...], list[Run]]] = {}
+    groups: dict[Names, dict[tuple[tuple[str, str], ...], list[Run]]] = {}
     for run in runs:
-        names = (run.game, run.operator, run.activation)
+        names = run.game, run.operator, run.function, run.activation
         groups.setdefault(names, {}).setdefault(tuple(sorted(_relevant(run).items())), []).append(run)
     return [
         _recipe(names, variant, same)
@@ -163,7 +167,7 @@ def _variants(settings: Sequence[Mapping[str, str]]) -> list[str]:
     return [", ".join([f"{key}={one[key]:.40}" for key in differing[:SHOWN]] + more) for one in ends]
 
 
-def _recipe(names: tuple[str, str, str], variant: str, runs: Sequence[Run]) -> Recipe:
+def _recipe(names: Names, variant: str, runs: Sequence[Run]) -> Recipe:
     finished = [run for run in runs if run.finished]
     counted = tuple({(run.seed, run.test_seed): run for run in finished}.values())
     repeated = tuple(run for run in finished if all(run is not other for other in counted))

@@ -34,6 +34,7 @@ class Run(BaseModel):
     """Why it failed."""
     game: str = NOT_AVAILABLE
     operator: str = NOT_AVAILABLE
+    function: str = NOT_AVAILABLE
     activation: str = NOT_AVAILABLE
     seed: int | None = None
     steps: int | None = None

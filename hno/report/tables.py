@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from hno.evaluation.format import NOT_AVAILABLE, at, number, percent, signed, whole
+from hno.evaluation.format import NAMES, NOT_AVAILABLE, at, number, percent, signed, whole
 from hno.evaluation.outcome import Pooled, pooled
 from hno.evaluation.sections import COUNTS, Column, plain, sections
 from hno.report.recipes import Recipe, Spread, best
@@ -64,7 +64,7 @@ def _range(found: Spread | None) -> str:
     return NOT_AVAILABLE if found is None else f"{percent(found.low)} to {percent(found.high)}"
 
 
-FILTERS = ("game", "operator", "activation", "seed")
+FILTERS = (*NAMES, "seed")
 """What the page is filtered by."""
 CACHED = "Labels that were cached took no time, and the total is then without them."
 RECIPE = (
@@ -76,7 +76,8 @@ RECIPE = (
 )  # fmt: skip
 RUN = (
     Column("name", "run"), Column("status", "status"), Column("game", "game"), Column("operator", "operator"),
-    Column("activation", "activation"), Column("seed", "seed"), Column("steps", "steps", format=whole), *COUNTS,
+    Column("function", "function"), Column("activation", "activation"), Column("seed", "seed"),
+    Column("steps", "steps", format=whole), *COUNTS,
     Column("worst", "worst type", format=_worst), Column("relative_excess", "excess cost", format=signed),
     Column("value_error", "value error", format=lambda value: number(value, 4)),
     Column("costate_error", "costate error", format=lambda value: number(value, 4)),

@@ -10,7 +10,7 @@ from hno.evaluation.episodes import FRAMES, episodes
 from hno.evaluation.outcome import outcome
 from hno.games import make
 from hno.games.kinematics import separation
-from hno.types import Extremal
+from hno.types import Extremal, Points, PotentialField
 from tests.fakes import evaluated, fake_labels
 from tests.lq import LinearQuadratic
 from tests.walkers import Walkers
@@ -70,6 +70,37 @@ def test_an_episode_shows_where_players_go_and_where_the_equilibrium_goes(sets: 
     middle = sets[0].x[3].float()
     ends = game.positions(middle)[[0, -1]]
     torch.testing.assert_close(torch.tensor(episode["label_positions"])[[0, -1]], ends, atol=1e-3, rtol=0)
+
+
+def two_branches(points: Points) -> PotentialField:
+    """Branch 1 is the best one while more than half of the horizon is left."""
+    early = points.tau - Walkers.horizon / 2
+    one, value = early.unsqueeze(-1), torch.zeros_like(points.theta)
+    return PotentialField(one, one, points.x.unsqueeze(-3), value, torch.stack([-early, early], -1))
+
+
+def test_the_branch_that_is_played_is_kept_at_every_time(sets: list[Extremal]) -> None:
+    for episode in episodes(evaluated(Walkers(), straight, sets, field=two_branches))["episodes"]:
+        assert episode["branch"] == [int(t < Walkers.horizon / 2) for t in episode["t"]]
+    assert all(episode["branch"] is None for episode in episodes(evaluated(Walkers(), straight, sets))["episodes"])
+
+
+@pytest.mark.parametrize(
+    ("height", "way", "other_side"),
+    [(0.2, 0.2, False), (0.2, -0.2, True), (-0.2, 0.2, True), (0.2, 0.5, False), (0.2, -30.0, False)],
+)
+def test_players_who_pass_on_another_side_than_the_equilibrium_are_marked(
+    height: float, way: float, other_side: bool
+) -> None:
+    """From 30 m aside they hardly turn around each other, and there is no side."""
+    label = labelled([height], [0.5], 1.0)
+    walked = torch.linspace(0, 4, len(label.t), dtype=torch.float64)
+    x = torch.stack([walked, torch.full_like(walked, way)], -1)[None, :, None].repeat(1, 1, 2, 1)
+    x[:, 0] = label.x[:, 0]
+    x[:, 0, :, 1] = way
+    label, start = label._replace(x=x), label
+    evaluation = evaluated(Walkers(), straight, [start])._replace(labels=[label])
+    assert [one["other_side"] for one in episodes(evaluation)["episodes"]] == [other_side] * 2
 
 
 def test_a_broken_episode_is_the_worst(sets: list[Extremal]) -> None:

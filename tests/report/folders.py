@@ -82,12 +82,14 @@ def make_results(
         table.append(row(theta, int(rng.binomial(STARTS, rate)), median_excess_cost=float(rng.normal(0.2, 0.1))))
     config = {
         "game": {"name": game, "constants": {}}, "operator": {"name": operator, "width": 64, "depth": 4},
+        "function": {"name": "value", "members": 1},
         "activation": {"name": activation}, "optimizer": {"name": "soap", "lr": 0.003}, "seed": seed,
         "trainer": {"max_steps": 2000, "threads": 1},
         "data": {"types": [list(t) for t in sorted(CORNERS)], "cache": None},
     }  # fmt: skip
     return {
-        "status": "finished", "reason": None, "game": game, "operator": operator, "activation": activation,
+        "status": "finished", "reason": None, "game": game, "operator": operator, "function": "value",
+        "activation": activation,
         "seed": seed, "steps": 2000, "config_hash": "0" * 16, "checkpoint": "best.ckpt",
         "seconds": {"labels": 36.0, "training": round(50 + 20 * rng.random(), 1), "validation": 6.0, "evaluation": 8.0},
         "metrics": {"loss/total": 0.05, "val/value_error": 0.02, "val/costate_error": 0.04},
@@ -112,7 +114,7 @@ def write_run(
     """A run's folder: results, metrics, episodes and what Hydra writes."""
     (folder / ".hydra").mkdir(parents=True, exist_ok=True)
     (folder / "results.json").write_text(json.dumps(results))
-    choices = {key: results.get(key) for key in ("game", "operator", "activation", "seed")}
+    choices = {key: results.get(key) for key in ("game", "operator", "function", "activation", "seed")}
     hydra = {"job": {"name": "train"}, "overrides": {"task": [f"{key}={value}" for key, value in choices.items()]}}
     (folder / ".hydra" / "hydra.yaml").write_text(json.dumps({"hydra": hydra}))
     if not extras:

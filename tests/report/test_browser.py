@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from hno.report.page import write_page
 from hno.report.runs import load
+from tests.report.folders import GRID5, make_episode, make_results, write_run
 
 playwright = pytest.importorskip("playwright.sync_api", reason="needs the package playwright")
 CHROMIUM = shutil.which("chromium")
@@ -110,6 +113,22 @@ def test_filters_hide_what_does_not_match_and_live_in_the_address(browser):
     browser.until("document.querySelector('#matching').textContent === '20 runs'")
 
 
+def test_what_is_learned_is_a_filter_of_its_own(context, tmp_path):
+    for name in ("potential", "value"):
+        results = make_results("drone", "sno", "tanh", 0, np.random.default_rng(0), GRID5[:2], function=name)
+        write_run(tmp_path / name, results)
+    write_page(load(tmp_path), tmp_path / "report.html")
+    opened = Browser(context, (tmp_path / "report.html").as_uri())
+    assert [row[1] for row in opened.rows("recipes")] == ["sno / potential / tanh", "sno / value / tanh"]
+    opened.filter(function="value")
+    assert [row[0] for row in opened.rows("runs")] == ["value"]
+    assert [row[1] for row in opened.rows("recipes")] == ["sno / value / tanh"]
+    opened.page.reload()
+    assert [row[0] for row in opened.rows("runs")] == ["value"]
+    assert opened.said == []
+    opened.page.close()
+
+
 def test_a_seed_shows_single_runs_in_place_of_pooled_ones(browser):
     pooled = browser.page.locator(".map:visible").first.inner_text()
     browser.filter(seed="0", game="narrow_road")
@@ -122,7 +141,7 @@ def test_a_column_sorts_by_value_with_missing_numbers_last(browser):
     for order, sign in (("ascending", 1), ("descending", -1)):
         head.click()
         assert head.locator("..").get_attribute("aria-sort") == order
-        texts = [row[8] for row in browser.rows("runs")]
+        texts = [row[9] for row in browser.rows("runs")]
         numbers = [int(text.replace(",", "")) for text in texts if text != "n/a"]
         assert numbers == sorted(numbers, key=lambda number: sign * number)
         assert texts[-2:] == ["n/a", "n/a"]
@@ -161,6 +180,22 @@ def test_the_discs_move_and_turn_red_in_a_collision(browser):
     far, near = fills(0), fills(25)
     assert danger not in far
     assert near == [danger, danger]
+
+
+def test_the_clock_says_which_branch_is_played(context, tmp_path):
+    folder = write_run(tmp_path, make_results("drone", "sno", "tanh", 0, np.random.default_rng(0), GRID5[:1]))
+    entry = make_episode("drone", (1.0, 1.0), "worst", 0.3, frames=5)
+    episodes = [entry | {"branch": [0, 0, 1, 1, 1], "other_side": True}, entry | {"kind": "typical"}]
+    (folder / "episodes.json").write_text(json.dumps({"episodes": episodes}))
+    write_page(load(folder), tmp_path / "report.html")
+    opened = Browser(context, (tmp_path / "report.html").as_uri())
+    opened.until("document.querySelector('#clock').textContent === '1.50 s, branch 1'")
+    assert "Passes on the other side than the equilibrium." in opened.page.inner_text("#said")
+    opened.page.click("#next")
+    opened.until("document.querySelector('#clock').textContent === '1.50 s'")
+    assert "other side" not in opened.page.inner_text("#said")
+    assert opened.said == []
+    opened.page.close()
 
 
 def test_the_keyboard_reaches_everything(browser):

@@ -42,7 +42,7 @@ def test_the_summary_repeats_the_counts(tmp_path):
     sweep = load(tmp_path)
     found = recipes(sweep.runs)
     text = markdown(sweep, found)
-    assert "| drone | sno / tanh | 1 | 150 | 3 | 2.00 % |" in text
+    assert "| drone | sno / value / tanh | 1 | 150 | 3 | 2.00 % |" in text
     assert "3 of 150" in text
     assert "- 1: a \\| b &lt;i>" in text
 

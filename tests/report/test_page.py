@@ -217,6 +217,37 @@ def test_episodes_of_any_number_of_players_and_without_a_distance_are_shown(tmp_
     assert ("collision radius" in shown["said"]) == (radius is not None)
 
 
+def test_branches_and_the_other_side_are_told(tmp_path):
+    entries = [make_episode("own", (1.0, 5.0), kind, 0.3, frames=5) for kind in ("worst", "typical")]
+    entries[0] |= {"branch": [0, 0, 1, 1, 1], "other_side": True}
+    entries[1] |= {"branch": None, "other_side": False}
+    folder = write_run(tmp_path, make_results("own", "sno", "tanh", 0, np.random.default_rng(0), GRID5[:1]))
+    (folder / "episodes.json").write_text(json.dumps({"episodes": entries}))
+    page = Page(render(load(folder)))
+    worst, typical = page.data["episodes"]
+    assert [frame["branch"] for frame in worst["frames"]] == [0, 0, 1, 1, 1]
+    assert {frame["branch"] for frame in typical["frames"]} == {None}
+    assert [("other side" in one["title"], "other side" in one["said"]) for one in (worst, typical)] == [
+        (True, True),
+        (False, False),
+    ]
+
+
+def test_branches_of_another_length_than_the_path_are_refused():
+    with pytest.raises(ValueError, match="arrays have shapes"):
+        episode(make_episode("own", (1.0, 5.0), "worst", 0.3, frames=5) | {"branch": [0, 1]})
+
+
+def test_conditions_of_start_states_are_explained(tmp_path):
+    results = make_results("drone", "sno", "tanh", 0, np.random.default_rng(0), GRID5[:1])
+    lines = [condition(name) | {"condition": {name: True}} for name in ("symmetric", "ties")]
+    write_run(tmp_path, results | {"robustness": [condition("noise"), *lines]}, extras=False)
+    texts = Page(render(load(tmp_path))).texts
+    assert {"symmetric", "ties", "Condition symmetric: all players start in the same own state."} <= set(texts)
+    ties = "Condition ties: the two cheapest equilibria of every start cost the same within 1 %"
+    assert [text for text in texts if text.startswith("Condition ")][1:] == [f"{ties}; at most 25 per type."]
+
+
 def test_curves_keep_their_ends_when_they_are_thinned(small_sweep, monkeypatch):
     full = page_data.learning_curves(recipes(small_sweep.runs), small_sweep.runs)
     monkeypatch.setattr(page_data, "POINTS", 4)

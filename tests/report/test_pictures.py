@@ -73,6 +73,18 @@ def test_a_view_shows_paths_up_to_its_frame_and_discs_that_turn_red() -> None:
     assert paths[0] < paths[1]
 
 
+def test_a_diamond_marks_where_another_branch_is_played(tmp_path: Path) -> None:
+    def diamonds(branch: list[int] | None) -> int:
+        (top,) = pictures.views(read(episode((1, 5), 0.3) | {"branch": branch}), 3, False, "a game").values()
+        (tmp_path / "top.svg").write_text(vega.svg(top))
+        paths = (mark.get("d", "") for mark in ET.parse(tmp_path / "top.svg").iter() if mark.tag.endswith("path"))
+        return sum(path.count("L") == 3 and path.endswith("Z") for path in paths)
+
+    without = diamonds(None)
+    found = [diamonds(branch) - without for branch in ([0, 0, 0, 0], [0, 1, 1, 1], [0, 1, 0, 0])]
+    assert found == [0, 2, 4]
+
+
 @pytest.mark.parametrize(("players", "radius"), [(1, None), (2, None), (2, 1.5), (3, 1.5)])
 def test_a_rollout_is_drawn_for_any_number_of_players(players: int, radius: float | None, tmp_path: Path) -> None:
     found = episode((1, 5), 0.3)

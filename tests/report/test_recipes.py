@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -28,7 +29,7 @@ def result(theta: tuple[float, ...], collisions: int, starts: int, excess_cost: 
 
 
 def write(folder: Path, seed: int, collisions: Sequence[int], **entries: Any) -> None:
-    names = {"game": "drone", "operator": "sno", "activation": "tanh"} | entries
+    names = {"game": "drone", "operator": "sno", "function": "value", "activation": "tanh"} | entries
     table = [row(theta, count, 100) for theta, count in zip((FIRST, SECOND), collisions, strict=True)]
     results = {"status": "finished", "reason": None, "seed": seed, "seconds": {"labels": 1.0 + seed}}
     results |= {"config": {"operator": names["operator"], "seed": seed}, "table": table, "episodes": None} | names
@@ -128,6 +129,26 @@ def test_another_setting_is_another_recipe_and_says_which(tmp_path):
     for name, weight in (("0", 0.1), ("1", 0.2)):
         write(tmp_path / name, 0, (0, 0), config={"loss": {"weight": weight}, "seed": 0, "data": {"cache": name}})
     assert [recipe.variant for recipe in recipes(loaded(tmp_path))] == ["loss.weight=0.1", "loss.weight=0.2"]
+
+
+def test_a_potential_and_values_are_recipes_of_their_own(tmp_path):
+    for name in ("potential", "value"):
+        write(tmp_path / name, 0, (0, 1), function=name)
+    found = recipes(loaded(tmp_path))
+    assert [(one.function, one.name, one.seeds) for one in found] == [
+        ("potential", "sno / potential / tanh", "1 seed"),
+        ("value", "sno / value / tanh", "1 seed"),
+    ]
+    assert [row["function"] for row in recipe_table(found).rows] == ["potential", "value"]
+
+
+def test_results_that_do_not_say_what_was_learned_have_names_without_it(tmp_path):
+    write(tmp_path / "0", 0, (0, 1))
+    results = json.loads((tmp_path / "0" / "results.json").read_text())
+    del results["function"]
+    (tmp_path / "0" / "results.json").write_text(json.dumps(results))
+    (recipe,) = recipes(loaded(tmp_path))
+    assert recipe.name == "sno / tanh"
 
 
 def test_the_same_seed_counts_once(tmp_path):

@@ -30,7 +30,7 @@ def test_a_whole_run_is_read_without_remarks(tmp_path):
     assert run.settings["operator.width"] == "64"
     assert "game.constants" not in run.settings
     assert len(run.curves["loss/total"]) == 40
-    assert run.command == "python train.py game=drone operator=sno activation=tanh seed=0"
+    assert run.command == "python train.py game=drone operator=sno function=value activation=tanh seed=0"
 
 
 def test_a_sweep_says_what_it_is(tmp_path):

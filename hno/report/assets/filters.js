@@ -1,6 +1,6 @@
 /** Filters live in the address (#game=drone&seed=0), so that a reload or a shared link keeps them. */
-const KEYS = ["game", "operator", "activation", "seed"];
 const form = $("filters");
+const KEYS = [...form.querySelectorAll("select")].map((select) => select.name);
 const state = Object.fromEntries(KEYS.map((key) => [key, ""]));
 const listeners = [];
 

@@ -36,7 +36,8 @@ function apart({ frames }) {
 
 function seek(frame) {
   player.frame = frame;
-  const clock = `${player.episode.frames[frame].t.toFixed(2)} s`;
+  const { t, branch } = player.episode.frames[frame];
+  const clock = `${t.toFixed(2)} s${branch === null ? "" : `, branch ${branch}`}`;
   $("scrub").value = frame;
   $("scrub").setAttribute("aria-valuetext", clock);
   $("clock").textContent = clock;
