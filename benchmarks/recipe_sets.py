@@ -62,24 +62,23 @@ HNO = f"operator=hno {TO_THE_END}"
 HARDENING = f"{HNO} loss.terms.residual=null loss.weights.residual=null ++loss.weights.annealed=0.02"
 FINISHED = "operator=hno data.pretrain=0.2 data.widening=0.2 data.finish=0.4"
 LATE = "operator=hno data.pretrain=0.4 data.widening=0.2 data.finish=0.2"
-VALUES = "function=value function.members=1 data.widen=[1.0]"
+START_BOX = "data.trajectories=160 data.widen=[1.0] data.adaptive.rounds=0"
+MIXED_BOXES = "data.trajectories=160 data.widen=[1.0,2.2] data.adaptive.rounds=0"
+ADAPTIVE = "data.trajectories=96 data.widen=[1.0,2.2] data.adaptive.rounds=2 data.adaptive.labels=256"
+"""About as many start states with labels as the two others have: 7 x 96 + 2 x 256 beside 7 x 160."""
+VALUES = f"function=value function.members=1 {START_BOX}"
 """What every recipe is that does not choose what it learns."""
 SHORT = "activation=tanh trainer.max_steps=1000"
 FIFTEEN = str([[a, b] for a, b in itertools.combinations_with_replacement(range(1, 6), 2)]).replace(" ", "")
 STEEP = f"{SHORT} optimizer.lr=1e-2"
 TEN = f"{STEEP} {CORNERS} data.trajectories=10"
 ANY = f"{HNO} {STEEP} {CORNERS} data.trajectories=200 data.interior_types=box"
-MIXED_BOXES = "data.widen=[1.0,2.2]"
 RECIPES: dict[str, dict[str, str]] = {
     "potential": {
-        "sno, V, start box": VALUES,
-        "sno, V, mixed boxes": f"function=value function.members=1 {MIXED_BOXES}",
-        "hno, V, start box": f"{VALUES} operator=hno",
-        "hno, V, mixed boxes": f"function=value function.members=1 {MIXED_BOXES} operator=hno",
-        "sno, W, start box": "function=potential data.widen=[1.0]",
-        "sno, W, mixed boxes": f"function=potential {MIXED_BOXES}",
-        "hno, W, start box": "function=potential data.widen=[1.0] operator=hno",
-        "hno, W, mixed boxes": f"function=potential {MIXED_BOXES} operator=hno",
+        f"{method}, {letter}, {where}": f"operator={method} {function} {labels}"
+        for method in ("sno", "hno")
+        for letter, function in (("V", "function=value function.members=1"), ("W", "function=potential"))
+        for where, labels in (("start box", START_BOX), ("mixed boxes", MIXED_BOXES), ("adaptive", ADAPTIVE))
     },
     "default": {
         "sno, sin": "",

@@ -162,8 +162,9 @@ class AdaptiveLabels(L.Callback):
 
     def _solved(self, data: GameData, group: Candidates, rows: Tensor) -> Extremal:
         game, x0, theta = subgame(data.game, group.tau), group.x[rows].double(), group.theta[rows].double()
-        jobs = zip(x0.split(CHUNK), theta.split(CHUNK), strict=True)
-        pool = joblib.Parallel(n_jobs=self.workers or joblib.cpu_count(), inner_max_num_threads=1, backend="loky")
+        jobs = list(zip(x0.split(CHUNK), theta.split(CHUNK), strict=True))
+        workers = min(self.workers or joblib.cpu_count(), len(jobs))
+        pool = joblib.Parallel(n_jobs=workers, inner_max_num_threads=1, backend="loky")
         call = joblib.delayed(solve)
         return join(pool(call(game, *job, self.solver, all_equilibria=data.potential) for job in jobs))
 
