@@ -19,6 +19,7 @@ def run(given: Arguments) -> int:
     if len(given.words) != 1:
         raise UsageError("Name one game: a registered name, or module:Class of a file in this folder.")
     from hno.games import make
+    from hno.games.potential import GAP, potential_gap
     from hno.games.testing import ContractError, check_game
 
     use_threads(1)
@@ -34,6 +35,10 @@ def run(given: Arguments) -> int:
         f"{name} keeps the contract of a game: {game.players} players, {game.state_dim} states and "
         f"{game.control_dim} controls each, {game.horizon:g} s."
     )
+    if game.potential:
+        print("It is a potential game: function=potential learns one function for all players, and is the default.")
+    elif game.players > 1 and potential_gap(game) <= GAP:
+        print("It is a potential game and does not say so. With `potential = True` it is learned by one function.")
     return 0
 
 

@@ -43,6 +43,13 @@ def test_what_cannot_be_loaded_is_named(capsys: Printed, monkeypatch: pytest.Mon
     assert "Could not be loaded: hno.games.mine: SyntaxError: invalid syntax (mine.py)" in found.err
 
 
+def test_a_game_is_told_whether_it_has_a_potential(capsys: Printed) -> None:
+    assert main(["check-game", "narrow_road"]) == 0
+    assert "It is a potential game: function=potential" in capsys.readouterr().out
+    assert main(["check-game", "tests.walkers:Walkers"]) == 0
+    assert "does not say so. With `potential = True`" in capsys.readouterr().out
+
+
 def test_a_registered_game_is_checked(capsys: Printed) -> None:
     assert main(["check-game", "narrow_road", "game.constants.radius=1.5"]) == 0
     assert "narrow_road keeps the contract of a game: 2 players" in capsys.readouterr().out
