@@ -7,7 +7,6 @@ where they cross, who goes over and who under.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 
 import torch
@@ -15,11 +14,6 @@ from torch import Tensor
 
 from hno.games import Game
 from hno.types import Extremal
-
-
-def pairs(game: Game) -> list[tuple[int, int]]:
-    """Every two players."""
-    return list(itertools.combinations(range(game.players), 2))
 
 
 def rotations(game: Game, x: Tensor) -> Tensor:
@@ -30,12 +24,14 @@ def rotations(game: Game, x: Tensor) -> Tensor:
         x: states, (B, K, P, n).
 
     Returns:
-        Sums of the rotation vectors from node to node, (B, pairs, 3); along the third axis only in the plane.
+        Sums of the rotation vectors from node to node, (B, pairs, 3), pairs in the order (1, 2), (1, 3), (2, 3)
+        and so on; in the plane they lie along the third axis.
     """
     place = game.positions(x)
     if place.shape[-1] == 2:
         place = torch.nn.functional.pad(place, (0, 1))
-    gap = torch.stack([place[..., j, :] - place[..., i, :] for i, j in pairs(game)], 1)
+    first, second = torch.triu_indices(game.players, game.players, 1)
+    gap = (place[..., second, :] - place[..., first, :]).movedim(-2, 1)
     before, after = gap[:, :, :-1], gap[:, :, 1:]
     normal = torch.linalg.cross(before, after)
     sine, cosine = normal.norm(dim=-1, keepdim=True), (before * after).sum(-1, keepdim=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import hashlib
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any, NamedTuple
 
 import lightning as L
@@ -13,24 +13,19 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset
 
-from hno.data.branches import principal_axes
 from hno.data.exchange import read_own
+from hno.data.labelled import LabelledRows
 from hno.data.labels import Report, Request, default_cache, labels_for
 from hno.data.plans import BATCH_SIZES, Collocation, LabelPlan
-from hno.data.rows import converged, potential_rows, rows_of
 from hno.data.sources import Known, Pool, sample_points
 from hno.games import Game
 from hno.types import (
     Batch,
     Extremal,
-    Labels,
-    Points,
-    PotentialLabels,
     Sample,
     Trajectory,
     Types,
     best_of,
-    joined,
     of_starts,
 )
 
@@ -101,17 +96,12 @@ class GameData(L.LightningDataModule):
         ]
         self.kept = [kept for _ in solved for *_, kept in shares] + [labels.validation] * len(self.own)
         """Start states of each label set that are held out."""
-        self.branches: Tensor | None = None
-        """Axes of the potential's branches, see `hno.data.branches`, (pairs, 3)."""
         self.label_seconds = 0.0
         self.extremals: list[Extremal] = []
-        self.train_rows: Sample | None = None
-        self._joined: tuple[int, Sample, Tensor] | None = None
+        self.labelled: LabelledRows | None = None
         self.val_rows: Sample | None = None
         self.visits: list[Visit] = []
         """The latest two validations."""
-        self.added: list[tuple[int, Sample]] = []
-        """Labelled rows that were added after a training step."""
 
     def _check(self) -> None:
         if self.collocation.types not in ("labelled", "box"):
@@ -156,39 +146,19 @@ class GameData(L.LightningDataModule):
         self.extremals = [*found, *self.own]
 
     def setup(self, stage: str) -> None:
-        """Load labels into memory."""
+        """Load labels into memory, once."""
         self.prepare_data()
-        if not self.extremals:
+        if not self.extremals or self.labelled is not None:
             return
         trained = [of_starts(found, 0, found.starts - kept) for found, kept in self._split()]
         held_out = [of_starts(found, found.starts - kept) for found, kept in self._split()]
-        if self.potential:
-            self.branches = principal_axes(self.game, converged(self.game, trained))
-            self.train_rows = potential_rows(self.game, trained, self.branches, swapped=True)
-            self.val_rows = potential_rows(self.game, held_out, self.branches)
-        else:
-            self.train_rows, self.val_rows = rows_of(self.game, trained), rows_of(self.game, held_out)
+        self.labelled = LabelledRows(self.game, trained, self.potential)
+        self.val_rows = self.labelled.of(held_out)
 
-    def extend(self, step: int, labels: Sequence[Extremal]) -> None:
-        """Train on more labels, of the game or what remains of it, from the batch after the next one of a step on."""
-        if any(len(found.status) for found in labels):
-            rows = potential_rows(self.game, labels, self.branches, swapped=True) if self.branches is not None else None
-            self.added.append((step, rows_of(self.game, labels) if rows is None else rows))
-
-    def rows(self, step: int) -> tuple[Sample, Tensor]:
-        """Labelled rows of a step, and the ones of them that a batch is drawn from: best equilibria count twice.
-
-        Batches are drawn a step ahead: what was added just before does not count.
-        """
-        known = [rows for after, rows in self.added if after < step]
-        if self._joined is None or self._joined[0] != len(known):
-            assert self.train_rows is not None
-            whole = joined([self.train_rows, *known])
-            drawn, labels = torch.arange(whole.size), whole.labels
-            if isinstance(labels, PotentialLabels):
-                drawn = torch.cat([drawn, labels.best.nonzero().squeeze(-1)])
-            self._joined = len(known), whole, drawn
-        return self._joined[1:]
+    @property
+    def train_rows(self) -> Sample | None:
+        """Labelled rows before any were added."""
+        return None if self.labelled is None else self.labelled.first
 
     def _split(self) -> Iterator[tuple[Extremal, int]]:
         """Labels of every set, and how many of its start states are held out; none without labels."""
@@ -227,16 +197,14 @@ class GameData(L.LightningDataModule):
 
     def state_dict(self) -> dict[str, Any]:
         """What batches depend on besides the step."""
-        return {"visits": [visit._asdict() for visit in self.visits], "added": [_plain(*entry) for entry in self.added]}
+        added = [] if self.labelled is None else self.labelled.state()
+        return {"visits": [visit._asdict() for visit in self.visits], "added": added}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore it."""
         self.visits = [Visit(**visit) for visit in state_dict["visits"]]
-        kinds = {True: PotentialLabels, False: Labels}
-        self.added = [
-            (step, Sample(Points(*points), kinds[self.potential](*labels), Types(*types)))
-            for step, points, labels, types in state_dict["added"]
-        ]
+        if self.labelled is not None:
+            self.labelled.restore(state_dict["added"])
 
     def batch(self, step: int, sizes: Mapping[str, int | None] | None = None) -> Batch:
         """The batch of one step, a pure function of (seed, step, rank), and of earlier `visits`.
@@ -249,8 +217,8 @@ class GameData(L.LightningDataModule):
         rank = self.trainer.global_rank if self.trainer is not None else 0
         generator = torch.Generator().manual_seed(mix(step, self.seed, rank))
         batch: Batch = {}
-        if "bvp" in self.streams and self.train_rows is not None:
-            (rows, drawn), size = self.rows(step), sizes["bvp"]
+        if "bvp" in self.streams and self.labelled is not None:
+            (rows, drawn), size = self.labelled.at(step), sizes["bvp"]
             chosen = drawn if size is None else drawn[torch.randint(len(drawn), (size,), generator=generator)]
             batch["bvp"] = rows.rows(chosen)
         if self.collocation.curriculum.active(step):
@@ -293,13 +261,6 @@ class GameData(L.LightningDataModule):
     def val_dataloader(self) -> DataLoader[Sample] | list[Any]:
         """Held-out labelled rows, in one batch; nothing without labels."""
         return [] if self.val_rows is None else DataLoader([self.val_rows], batch_size=None)  # type: ignore[arg-type]  # a list is a data set
-
-
-def _plain(step: int, rows: Sample) -> list[Any]:
-    """Added rows as plain containers, for checkpoints."""
-    assert rows.labels is not None
-    assert rows.types is not None
-    return [step, list(rows.points), list(rows.labels), list(rows.types)]
 
 
 class _Steps(IterableDataset[Batch]):

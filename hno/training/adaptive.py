@@ -142,8 +142,11 @@ class AdaptiveLabels(L.Callback):
                 found.append(self._solved(data, group, rows))
                 costs.append(cost[rows])
         best = [best_of(each) for each in found]
-        safe = [(each.status == Status.CONVERGED) & (each.clearance > 0) for each in best]
-        data.extend(step, [part(each, (each.status == Status.CONVERGED) & (each.clearance > 0)) for each in found])
+        safe = [sound(each) for each in best]
+        assert data.labelled is not None
+        data.labelled.extend(
+            step, [part(each, (each.status == Status.CONVERGED) & (each.clearance > 0)) for each in found]
+        )
         lost = [(cost.cpu() / b.cost - 1)[s] for cost, b, s in zip(costs, best, safe, strict=True)]
         unsolved = sum(int((each.status != Status.CONVERGED).sum()) for each in best)
         labelled = sum(len(each.status) for each in best)
@@ -220,3 +223,8 @@ def judged(policy: Feedback, group: Candidates, dt: float) -> tuple[Tensor, Tens
         played = rollout(game, policy, x, theta, dt)
     gap = (played.cost - promised).abs() / (like + promised.abs())
     return gap.nan_to_num(torch.inf, torch.inf).cpu(), played.cost.cpu(), played.collided.cpu()
+
+
+def sound(found: Extremal) -> Tensor:
+    """Which labels are trained on: those that converged and do not collide, (B,)."""
+    return (found.status == Status.CONVERGED) & (found.clearance > 0)

@@ -83,8 +83,8 @@ def test_what_a_round_labels_is_trained_on(tmp_path: Path, solved: Solved, poten
     assert [entry.step for entry in found.rounds] == PLAN.steps(STEPS)
     assert all(entry.labelled == PLAN.labels for entry in found.rounds)
     assert found.seconds["added_labels"] > 0
-    before, _ = labelled.rows(0)
-    after, drawn = labelled.rows(STEPS)
+    before, _ = labelled.labelled.at(0)
+    after, drawn = labelled.labelled.at(STEPS)
     assert before.size == labelled.train_rows.size < after.size
     assert set(drawn.tolist()) == set(range(after.size))
     own = sum(len(x0) * (1 + round(tau / 0.1)) for tau, x0, _ in solved.asked)
@@ -97,7 +97,7 @@ def test_what_a_round_labels_is_trained_on(tmp_path: Path, solved: Solved, poten
 def test_time_to_go_ends_with_the_game(tmp_path: Path, solved: Solved) -> None:
     _, labelled, _ = trained(tmp_path, True)
     assert len({tau for tau, *_ in solved.asked}) > 1
-    points = [torch.cat(column) for column in zip(*(rows.points for _, rows in labelled.added), strict=True)]
+    points = [torch.cat(column) for column in zip(*(rows.points for _, rows in labelled.labelled.added), strict=True)]
     for horizon, starts, _ in solved.asked:
         for x0 in starts.float():
             first = (points[1] == x0).flatten(1).all(-1)
@@ -110,7 +110,7 @@ def test_a_batch_that_is_drawn_already_does_not_change() -> None:
     labelled = data(True)
     labelled.setup("fit")
     before = [labelled.batch(step)["bvp"] for step in range(4)]
-    labelled.extend(2, [fake_labels(make("narrow_road"), (2.0, 3.0), count=5, seed=9)])
+    labelled.labelled.extend(2, [fake_labels(make("narrow_road"), (2.0, 3.0), count=5, seed=9)])
     after = [labelled.batch(step)["bvp"] for step in range(4)]
     for one, other in list(zip(before, after, strict=True))[:3]:
         assert torch.equal(one.points.x, other.points.x)
@@ -125,7 +125,7 @@ def test_a_resumed_run_with_rounds_is_the_uninterrupted_one(tmp_path: Path, solv
     resumed, labelled, again = trained(tmp_path / "cut", potential, resume=tmp_path / "cut" / LAST)
     assert equal(whole, resumed)
     assert [entry[:-1] for entry in found.rounds] == [entry[:-1] for entry in again.rounds]
-    assert len(labelled.added) == 2
+    assert len(labelled.labelled.added) == 2
     assert PLAN.steps(STEPS)[0] < EVERY < PLAN.steps(STEPS)[1]  # one before the cut, one after
 
 
