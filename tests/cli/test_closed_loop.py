@@ -225,7 +225,7 @@ def test_an_error_that_explodes_is_divergence(command: Command, monkeypatch: pyt
     def training_step(self: TrainingModule, batch: Batch, batch_idx: int) -> Tensor:
         if self.global_step == 3:
             with torch.no_grad():
-                self.operator.networks[0].branch.layers[-1].weight.mul_(1e4)
+                self.operator.network.branch.layers[-1].weight.mul_(1e4)
         return original(self, batch, batch_idx)
 
     monkeypatch.setattr(TrainingModule, "training_step", training_step)

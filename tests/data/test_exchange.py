@@ -31,6 +31,8 @@ def test_what_comes_in_is_what_went_out(labels: Callable[..., Extremal], arrays:
         assert torch.equal(getattr(ours, name), getattr(theirs, name)), name
     torch.testing.assert_close(theirs.u, ours.u, rtol=0, atol=1e-9)
     assert theirs.status.tolist() == [Status.CONVERGED] * len(ours.status)
+    torch.testing.assert_close(theirs.potential, ours.potential, rtol=1e-3, atol=1e-3)
+    assert theirs.start.tolist() == list(range(len(ours.status)))
 
 
 def test_certificates_are_computed_and_tell_good_from_bad(arrays: dict[str, np.ndarray]) -> None:

@@ -49,10 +49,10 @@ def test_a_condition_says_what_is_unusual_about_it() -> None:
     entries = {"symmetric": True, "widen": 2, "noise": 0.2, "delay": 3, "components": [1]}
     condition = read_condition(make("narrow_road"), entries, Condition("any", disturbance=Disturbance(seed=7)))
     assert condition.entries() == entries | {"components": (1,)}
-    assert condition.starts == (2, True)
+    assert condition.starts == (2, True, False)
     assert condition.disturbance.seed == 7
     assert Condition("usual").entries() == {}
 
 
 def test_entries_of_a_condition_are_those_of_starts_and_disturbances() -> None:
-    assert set(ENTRIES) == {"widen", "symmetric", *Disturbance._fields} - {"seed"}
+    assert set(ENTRIES) == {"widen", "symmetric", "ties", *Disturbance._fields} - {"seed"}

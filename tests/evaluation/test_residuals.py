@@ -44,7 +44,8 @@ def riccati(error: Callable[[Tensor], tuple[Tensor, Tensor]]) -> ValueOperator:
         return Field(-p * x**2 + more, -rate * x**2 + slope, (-2 * p * x)[..., None, None])
 
     scales = Scales(torch.tensor(2.0), torch.ones(1, 1, 1))
-    fake: Any = SimpleNamespace(game=one_player(), field=field, scales=scales)
+    game = one_player()
+    fake: Any = SimpleNamespace(game=game, problem=game, field=field, scales=scales)
     fake.view = functools.partial(ValueOperator.view, fake)
     return fake
 

@@ -81,12 +81,14 @@ def test_entries_replace_those_of_the_table() -> None:
         "same": {},
         "wide": {"widen": 2},
         "alike": {"symmetric": True},
+        "tied": {"ties": True},
         "wind": {"drift": 0.1, "components": [0, 1], "noise": 0},
     }
     assert read_conditions(make("narrow_road"), content, base) == [
         Condition("same", 1.5, disturbance=base.disturbance),
         Condition("wide", 2.0, disturbance=base.disturbance),
-        Condition("alike", 1.5, True, base.disturbance),
+        Condition("alike", 1.5, True, disturbance=base.disturbance),
+        Condition("tied", 1.5, ties=True, disturbance=base.disturbance),
         Condition("wind", 1.5, disturbance=Disturbance(0, 1, 7, drift=0.1, components=(0, 1))),
     ]
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,8 @@ from hno.data import datamodule as data_module
 from hno.data.curriculum import Curriculum
 from hno.games import make
 from hno.losses import LossTerm, Objective, View, make_objective
-from hno.operators import ValueOperator
+from hno.operators import Choice, ValueOperator
+from hno.operators import make_operator as built
 from hno.training import Fitted, Settings, fit
 from hno.training.checkpoint import Provenance, load_operator, record
 from hno.training.fit import LAST
@@ -36,14 +38,22 @@ def settings(**changes: Any) -> Settings:
     return Settings(**(usual | changes))
 
 
-def labelled_data(seed: int = 0, sampler: Mapping[str, float] = {"box": 0.5, "rollout": 0.5}) -> GameData:
-    """Every stream, on labels that were not solved; what validation visits is drawn from."""
+def labelled_data(
+    seed: int = 0, sampler: Mapping[str, float] = {"box": 0.5, "rollout": 0.5}, *, potential: bool = False
+) -> GameData:
+    """Every stream, on labels that were not solved; what validation visits is drawn from.
+
+    Where a potential is learned, the first start of each type has two equilibria.
+    """
     game, plan = make("narrow_road"), LabelPlan(types=TYPES, trajectories=3, validation=1, cache=Path("unused"))
     collocation = Collocation(make_sampler(sampler), Curriculum(2, 3))
-    data = GameData(
-        game, {"bvp", "interior", "terminal"}, seed, plan, collocation, {"bvp": 16, "interior": 16, "terminal": 4}
-    )
-    data.extremals = [fake_labels(game, theta, seed=row) for row, theta in enumerate(TYPES)]
+    sizes = {"bvp": 16, "interior": 16, "terminal": 4}
+    streams = {"bvp", "interior", "terminal"}
+    data = GameData(game, streams, seed, plan, collocation, sizes, potential=potential)
+    data.extremals = [fake_labels(game, theta, 5 if potential else 4, seed=row) for row, theta in enumerate(TYPES)]
+    if potential:
+        start = torch.tensor([0, 0, 1, 2, 3])
+        data.extremals = [found._replace(start=start) for found in data.extremals]
     return data
 
 
@@ -52,9 +62,20 @@ def trained(
 ) -> tuple[ValueOperator, Fitted]:
     callbacks = changes.pop("callbacks", [])
     operator = operator or small_operator(seed=seed)
-    objective = make_objective({name: {} for name in WEIGHTS}, WEIGHTS, balance=True)
-    found = fit(operator, objective, labelled_data(), settings(**changes), folder, resume=resume, callbacks=callbacks)
+    weights = WEIGHTS | ({"branches": 1.0} if operator.potential else {})
+    objective = make_objective({name: {} for name in weights}, weights, balance=True)
+    data = labelled_data(potential=operator.potential)
+    found = fit(operator, objective, data, settings(**changes), folder, resume=resume, callbacks=callbacks)
     return operator, found
+
+
+POTENTIAL = replace(architecture(), function=Choice("potential", {"exact_terminal": False}))
+
+
+def potential_operator(seed: int = 0) -> ValueOperator:
+    """A small operator of a potential."""
+    torch.manual_seed(seed)
+    return built(make("narrow_road"), POTENTIAL)
 
 
 def equal(one: ValueOperator, other: ValueOperator) -> bool:
@@ -86,18 +107,70 @@ class PowerCut(L.Callback):
             raise PowerCutError
 
 
+@pytest.mark.parametrize("make_operator", [lambda seed: small_operator(seed=seed), potential_operator], ids=["V", "W"])
 @pytest.mark.parametrize("name", ["soap", "adam"])
-def test_a_resumed_run_is_the_uninterrupted_one_bit_by_bit(tmp_path: Path, name: str) -> None:
+def test_a_resumed_run_is_the_uninterrupted_one_bit_by_bit(
+    tmp_path: Path, name: str, make_operator: Callable[[int], ValueOperator]
+) -> None:
     optimizer = {"name": name, "lr": 1e-2}
-    whole, found = trained(tmp_path / "whole", optimizer=optimizer)
+    whole, found = trained(tmp_path / "whole", operator=make_operator(0), optimizer=optimizer)
     with pytest.raises(PowerCutError):
-        trained(tmp_path / "cut", optimizer=optimizer, callbacks=[PowerCut()])
+        trained(tmp_path / "cut", operator=make_operator(0), optimizer=optimizer, callbacks=[PowerCut()])
     torch.manual_seed(7)
-    resumed, again = trained(tmp_path / "cut", seed=3, resume=tmp_path / "cut" / LAST, optimizer=optimizer)
+    cut = tmp_path / "cut"
+    resumed, again = trained(cut, operator=make_operator(3), resume=cut / LAST, optimizer=optimizer)
     assert again.trainer.global_step == STEPS
     assert equal(whole, resumed)
     assert found.metrics == again.metrics
     assert found.best == again.best
+
+
+@pytest.mark.parametrize("potential", [True, False])
+def test_an_operator_and_data_that_learn_different_things_are_refused(tmp_path: Path, potential: bool) -> None:
+    operator, data = potential_operator() if potential else small_operator(), labelled_data(potential=not potential)
+    learned = {True: "a potential", False: "the players' values"}
+    wanted = (
+        f"The operator learns {learned[potential]}, the data label {learned[not potential]}: .*"
+        r"GameData\(potential=operator\.potential\)"
+    )
+    with pytest.raises(ValueError, match=wanted):
+        fit(operator, make_objective({"value": {}}, {"value": 1.0}), data, settings(), tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_operator_of_a_potential_learns_from_all_equilibria(tmp_path: Path) -> None:
+    """All terms are in the loss, which falls, and only branches that a label has are played afterwards."""
+    losses: list[float] = []
+
+    class Watch(L.Callback):
+        def on_train_batch_end(self, trainer: L.Trainer, pl_module: Any, outputs: Any, *others: object) -> None:
+            losses.append(float(outputs["loss"]))
+
+    weights = {"value": 1.0, "costate": 1.0, "branches": 1.0}
+    operator, data = potential_operator(), labelled_data(potential=True)
+    objective = make_objective({name: {} for name in weights}, weights)
+    found = fit(operator, objective, data, settings(steps=60), tmp_path, callbacks=[Watch()], validation=[])
+    assert {f"loss/{name}" for name in (*weights, "total")} <= found.metrics.keys()
+    assert {"val/value_error", "val/costate_error"} <= found.metrics.keys()
+    assert sum(losses[-5:]) < 0.9 * sum(losses[:5])
+    assert torch.equal(operator.value_scale, data.scales()[0])
+    assert data.train_rows is not None
+    assert operator.active.nonzero().squeeze(-1).tolist() == data.train_rows.types.branch.unique().tolist()
+
+
+def test_branches_that_no_label_has_are_closed_by_a_training(tmp_path: Path) -> None:
+    """Labels in which nobody moves sideways: seen from player 1, player 2 turns one way in all of them, or in none."""
+    operator, data = potential_operator(), labelled_data(potential=True)
+    still = [found._replace(x=found.x[:1, :1].expand_as(found.x).contiguous()) for found in data.extremals]
+    data.extremals = still
+    objective = make_objective({"value": {}}, {"value": 1.0})
+    entries = record(operator.game, POTENTIAL, Provenance("mine", TYPES))
+    found = fit(operator, objective, data, settings(steps=1), tmp_path, validation=[], record=entries)
+    assert operator.active.tolist() == [True, False]
+    loaded, _, _ = load_operator(found.checkpoint)
+    assert loaded.active.tolist() == [True, False]
+    points = random_points(operator.game)
+    assert all(map(torch.equal, loaded.field(points), operator.field(points)))
 
 
 def test_what_comes_back_is_the_best_or_the_last_checkpoint(tmp_path: Path) -> None:
