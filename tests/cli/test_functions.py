@@ -64,7 +64,7 @@ def test_both_functions_in_one_sweep(command: Command, tmp_path) -> None:
     sweep = f"hydra.sweep.dir={tmp_path}/sweep"
     run = command("train", "-m", sweep, *SMOKE, "trainer.max_steps=2", "function=value,potential")
     assert run.code == 0, run.text
-    jobs = [Outcome(0, "", folder) for folder in sorted((tmp_path / "sweep").glob("*_narrow_road_hno_sin"))]
+    jobs = [Outcome(0, "", folder) for folder in sorted((tmp_path / "sweep").glob("*_narrow_road_hno_*_sin"))]
     assert [(job.results["status"], job.results["function"]) for job in jobs] == [
         ("finished", "value"), ("finished", "potential"),
     ]  # fmt: skip
