@@ -57,7 +57,9 @@ class Crossing(Merging):
 
 
 class Nearest(Crossing):
-    """The same with the nearest neighbour alone in one constraint, which has kinks."""
+    """The same with the nearest neighbour alone in one constraint, which has kinks: that makes no potential."""
+
+    potential = False
 
     def constraint(self, x: Tensor, theta: Tensor) -> Tensor:
         return super().constraint(x, theta).amax(-1, keepdim=True)

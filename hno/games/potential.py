@@ -82,7 +82,7 @@ def require_potential(game: Game) -> None:
         raise ValueError(
             f"{type(game).__name__} {found}: in a potential game a player who deviates alone changes its own running "
             "cost as much as `potential_cost`, and its own reward at the end as much as the sum of all. State that "
-            "method, or learn the players' values with function=value."
+            "method and `potential = True`, or set `potential = False` and learn the players' values (function=value)."
         )
 
 

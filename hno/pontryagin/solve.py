@@ -10,7 +10,7 @@ from torch import Tensor
 
 from hno.games import Game
 from hno.games.base import own_costate
-from hno.games.potential import Team
+from hno.games.potential import Team, require_potential
 from hno.pontryagin.certificates import global_gap, local_gap, reintegration_error
 from hno.pontryagin.collocation import Collocation, Iterate
 from hno.pontryagin.integrate import runge_kutta
@@ -60,7 +60,7 @@ def solve(
         Rows without a converged start carry the status and residual of their best attempt.
 
     Raises:
-        ValueError: wrong shapes or entries that are not finite.
+        ValueError: wrong shapes or entries that are not finite, or a game that says wrongly that it has a potential.
     """
     _check(game, x0, theta)
     with (
@@ -85,6 +85,8 @@ def _check(game: Game, x0: Tensor, theta: Tensor) -> None:
     for name, tensor in (("x0", x0), ("theta", theta)):
         if not bool(tensor.isfinite().all()):
             raise ValueError(f"{name} has entries that are not finite, first in row {_first_bad_row(tensor)}.")
+    if game.potential:
+        require_potential(game)
 
 
 def _first_bad_row(tensor: Tensor) -> int:

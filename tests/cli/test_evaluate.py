@@ -13,6 +13,7 @@ import hno
 from hno.cli.config import config_dir
 from hno.cli.evaluate import types_to_evaluate
 from hno.control.rollout import Policy
+from hno.data import ties
 from hno.evaluation import closed_loop
 from hno.evaluation.residuals import REGIONS
 from hno.games import Game, make
@@ -184,6 +185,13 @@ def test_without_a_safe_start_the_rate_is_not_applicable(command: Command, rando
     assert "No rate (n/a) at (1, 1): of 4 starts none has an equilibrium that keeps 50 m" in run.text
 
 
+@pytest.fixture
+def few_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ties are looked for among few pairs of starts at a time; they are the same ones."""
+    monkeypatch.setattr(ties, "BATCH", 4)
+
+
+@pytest.mark.usefixtures("few_pairs")
 def test_without_a_safe_start_every_section_says_so(command: Command, random_checkpoint: Path) -> None:
     both = f"checkpoint=[{random_checkpoint},{random_checkpoint}]"
     run = command("evaluate", both, "theta=1,1", "clearance=50", "robustness=true", *FAST)
@@ -221,6 +229,7 @@ def test_residuals_are_a_section_that_can_be_switched_off(command: Command, rand
     assert "HJI residual" not in without.text
 
 
+@pytest.mark.usefixtures("few_pairs")
 def test_robustness_is_a_section_on_request(command: Command, random_checkpoint: Path) -> None:
     arguments = (f"checkpoint={random_checkpoint}", "theta=1,1;2,2", "residuals=false", *FAST)
     asked = (*arguments, "robustness=true", "conditions.heading={drift: 0.1, components: [2]}")
@@ -235,6 +244,7 @@ def test_robustness_is_a_section_on_request(command: Command, random_checkpoint:
         assert [entry[name] for entry in plain["types"]] == [row[name] for row in table]
     assert rows["belief"]["condition"] == {"belief": 0.5}
     assert rows["symmetric"]["condition"] == {"symmetric": True}
+    assert rows["ties"]["condition"] == {"ties": True}
     assert rows["widened"]["median_label_cost"] != plain["median_label_cost"]
     costs = [row["median_excess_cost"] for row in rows.values()]
     assert len(set(costs)) == len(costs), "every condition changes something"

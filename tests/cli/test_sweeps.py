@@ -99,7 +99,8 @@ def grid(command: Command, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> I
         made: Grid = []
 
         def take(task: launch.Task, chosen: TrainSettings, folder: Path) -> bool:
-            tests, names = chosen.evaluation, (chosen.operator["name"], chosen.activation["name"])
+            assert (chosen.function["name"], chosen.function["members"]) == ("value", 1), "the paper's are values"
+            tests, names = chosen.evaluation, (chosen.operator.name, chosen.activation["name"])
             made.append((
                 chosen.game.name, *names, chosen.seed, chosen.optimizer["lr"], tests.starts, tests.safe,
                 len(tests.types), chosen.trainer.max_steps,

@@ -49,6 +49,13 @@ def test_more_ties_begin_with_the_fewer() -> None:
     assert torch.equal(states(1), states(2)[:1])
 
 
+def test_ties_do_not_depend_on_how_many_pairs_are_tried_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    once = states(1)
+    monkeypatch.setattr(ties, "BATCH", 5)
+    again = start_states(Walkers(), REQUEST._replace(starts=1))
+    torch.testing.assert_close(again, once, rtol=0, atol=1e-9)
+
+
 def test_a_game_that_hardly_has_any_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     """All starts are one here, so that no two go different ways."""
     monkeypatch.setattr(ties, "MOST", 1)

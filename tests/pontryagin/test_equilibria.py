@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import sys
 
 import pytest
 import torch
@@ -13,7 +14,7 @@ from hno.games import make
 from hno.games.potential import Team
 from hno.pontryagin.solve import Solver, solve
 from hno.types import Extremal, Status, best_of, join, of_starts, part
-from tests.crossing import Merging
+from tests.crossing import Merging, Nearest
 from tests.fakes import fake_labels
 from tests.lq import random_game
 
@@ -65,6 +66,21 @@ def test_a_game_that_is_no_potential_game_has_none() -> None:
     found = solve(game, x0, torch.zeros(2, 2), all_equilibria=True)
     assert bool(found.potential.isnan().all())
     assert found.start.tolist() == [0, 1], "a linear-quadratic game has one equilibrium"
+
+
+class Claimed(Nearest):
+    potential = True
+
+
+def test_a_game_that_says_wrongly_that_it_has_a_potential_is_refused_before_anything_is_solved(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    module = sys.modules[solve.__module__]  # the function has its name
+    monkeypatch.setattr(module, "find_starts", lambda *arguments: pytest.fail("a search began"))
+    game = Claimed()
+    x0 = game.initial_box.sample(2, torch.Generator().manual_seed(0))
+    with pytest.raises(ValueError, match=r"Claimed misses by .* set `potential = False`"):
+        solve(game, x0, torch.ones(2, 3))
 
 
 class Unsolvable(Merging):
