@@ -48,8 +48,11 @@ def run(given: Arguments) -> int:
 def generate(settings: LabelSettings) -> None:
     """Generate, and print a table and where the sets are."""
     game, cache = make(settings.game.name, **settings.game.constants), Path(settings.cache or default_cache())
+    every = settings.all_equilibria
+    if every is None:
+        every = game.potential and settings.split == "train"
     requests = [
-        Request(theta, settings.n, settings.seed, settings.split, settings.widen)
+        Request(theta, settings.n, settings.seed, settings.split, settings.widen, all_equilibria=every)
         for theta in parse_types(game, settings.theta, key="theta")
     ]
     console, report = Console(), label_progress(functools.partial(print, flush=True))

@@ -174,6 +174,7 @@ class LabelSettings(Settings):
     n: Size
     seed: Seed
     split: Literal["train", "test"]
+    all_equilibria: bool | None
     widen: Positive
     workers: Size | None
     cache: Text | None

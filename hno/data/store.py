@@ -88,7 +88,9 @@ def read_labels(path: Path) -> tuple[Extremal, dict[str, Any]]:
         found = header["format"], header["sha256"], header["provenance"]
     except (KeyError, ValueError, TypeError) as error:
         raise LabelFileError(f"{path} is a safetensors file without hno's metadata. {_ADVICE}") from error
-    if found[0] != FORMAT or set(tensors) | ADDED != set(Extremal._fields):
+    if found[0] == FORMAT and (missing := sorted(set(Extremal._fields) ^ (set(tensors) | ADDED))):
+        raise LabelFileError(f"{path} has other columns than labels of this version: {', '.join(missing)}. {_ADVICE}")
+    if found[0] != FORMAT:
         raise LabelFileError(f"{path} has format {found[0]}, expected {FORMAT}. {_ADVICE}")
     if found[1] != _digest(tensors):
         raise LabelFileError(f"{path} is damaged: its content does not match its checksum. {_ADVICE}")
