@@ -93,7 +93,7 @@ def test_wandb_gets_pictures_and_the_worst_stored_episode(command: Command, monk
     )
     run = command("train", *SMOKE, "trainer.max_steps=1", "logger=wandb")
     assert run.code == 0, run.text
-    assert titles == ["narrow_road / hno / sin\nsmallest clearance, -0.20 m at (1,1)"]
+    assert titles == ["narrow_road / hno / potential / sin\nsmallest clearance, -0.20 m at (1,1)"]
     kept = {path.name.split("_")[0] for path in run.folder.glob("wandb/offline-run-*/files/media/*/*.png")}
     assert kept == {"worst", "rollout", "collision"}
     summary = offline_run(run.folder).summary

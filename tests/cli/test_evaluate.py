@@ -35,7 +35,7 @@ def test_evaluation_of_a_trained_model_repeats_the_table_of_its_run(command: Com
     assert {name: results[name] for name in ("game", "operator", "activation", "seed", "status")} == {
         "game": "narrow_road", "operator": "hno", "activation": "sin", "seed": 0, "status": "finished",
     }  # fmt: skip
-    assert "narrow_road / hno / sin" in run.text
+    assert "narrow_road / hno / potential / sin" in run.text
     assert {path: path.read_bytes() for path in before} == before
 
 

@@ -112,7 +112,7 @@ def test_results_hold_every_part_of_the_run(command: Command) -> None:
 def test_run_says_what_happened(command: Command) -> None:
     run = command("train", *SMOKE, "trainer.max_steps=4", "trainer.print_every=2")
     assert "step 2 of 4" in run.text
-    assert "narrow_road / hno / sin" in run.text
+    assert "narrow_road / hno / potential / sin" in run.text
     assert str(run.folder / "results.json") in run.text.replace("\n", "")
     log = (run.folder / "train.log").read_text()
     assert "step 4 of 4" in log

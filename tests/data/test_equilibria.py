@@ -159,7 +159,7 @@ def test_starts_come_from_every_box_and_some_of_each_are_held_out(
         labels = data.train_rows.labels
         assert isinstance(labels, PotentialLabels)
         assert int(labels.best.sum()) == 2 * len(types) * trajectories * nodes, "of either order of the players"
-        assert len(data.drawn) == rows + int(labels.best.sum())
+        assert len(data.labelled.at(0)[1]) == rows + int(labels.best.sum())
 
 
 def test_held_out_starts_are_not_trained_on_with_any_of_their_equilibria(solved: list[Tensor], tmp_path: Path) -> None:

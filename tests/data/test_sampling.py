@@ -282,10 +282,10 @@ def test_a_policy_that_breaks_at_its_start_leaves_points_to_draw(make_data: Make
 
 def test_visits_survive_a_checkpoint(make_data: MakeData) -> None:
     data, resumed, fresh = (make_data(sampler=ONLY["rollout"]) for _ in range(3))
-    assert data.state_dict() == {"visits": []}
+    assert data.state_dict() == {"visits": [], "added": []}
     data.visit(played(data.game))
     resumed.load_state_dict(data.state_dict())
-    fresh.load_state_dict({"visits": []})
+    fresh.load_state_dict({"visits": [], "added": []})
     for batch in (resumed.batch(6), resumed.batch(6)):
         assert torch.equal(batch["interior"].points.x, data.batch(6)["interior"].points.x)
     assert not fresh.visits

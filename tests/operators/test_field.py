@@ -9,9 +9,9 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from hno.operators.inputs import distinct_types, ego_views, tables
+from hno.operators.inputs import distinct_types, ego_views
 from hno.training.checkpoint import CheckpointError, Provenance, check_resumable, load_operator, record
-from hno.types import Field, Labels, Points, Sample, Types
+from hno.types import Field, Labels, Points, Sample, Types, tables
 from tests.operators.conftest import ACTIVATIONS, GAMES, MakeOperator, architecture, random_points
 
 
