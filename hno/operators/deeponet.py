@@ -14,6 +14,10 @@ from hno.operators.network import Inputs, Network, networks
 from hno.operators.value_gradient import Kernels, Layer, value_gradient
 
 
+TABLE = 512
+"""Branch inputs up to which values are computed for all of them."""
+
+
 class MLP(nn.Module):
     """Fully connected net with one activation object, hence one trainable slope.
 
@@ -90,8 +94,19 @@ class DeepONet(Network):
         return torch.linalg.vecdot(self.trunk(self._pooled(y)), self.branch(sensors)[which])
 
     def values(self, y: Tensor, sensors: Tensor, which: Tensor) -> Tensor:
-        """Values at each row for several branch inputs: the trunk runs once."""
-        return torch.linalg.vecdot(self.trunk(self._pooled(y)).unsqueeze(-2), self.branch(sensors)[which])
+        """Values at each row for several branch inputs: the trunk runs once.
+
+        Where there are few of them, one product gives the values for all, and each row takes its own: the derivative of
+        that costs less than that of a look-up of coefficients.
+        """
+        hidden, last = self.trunk.folded()
+        h, branch = self._pooled(y), self.branch(sensors)
+        for weight, bias in hidden:
+            h = self.trunk.activation.core(torch.addmm(bias, h, weight.mT))
+        coefficient, shift = branch @ last.weight, branch @ last.bias
+        if len(branch) > TABLE:
+            return torch.linalg.vecdot(h.unsqueeze(-2), coefficient[which]) + shift[which]
+        return (h @ coefficient.mT + shift).gather(-1, which)
 
     def value_gradient(self, y: Tensor, sensors: Tensor, which: Tensor) -> tuple[Tensor, Tensor]:
         """Value at each row and its gradient in y.
