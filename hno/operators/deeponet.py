@@ -13,7 +13,6 @@ from hno.operators.activations import Activation, ClosedFormActivation
 from hno.operators.network import Inputs, Network, networks
 from hno.operators.value_gradient import Kernels, Layer, value_gradient
 
-
 TABLE = 512
 """Branch inputs up to which values are computed for all of them."""
 
