@@ -142,8 +142,9 @@ def label_progress(say: Callable[[str], None] = log.info, every: float = 10.0) -
         if now - last >= every or not left:
             last = now
             counts = f"{progress.converged} converged, {progress.done - progress.converged} failed"
-            seconds = (now - began) / max(progress.done, 1) * left
-            say(f"labels: {progress.done} of {progress.total}: {counts}, {seconds:.0f} s left")
+            rate = progress.done / max(now - began, 1e-9)
+            seconds = left / max(rate, 1e-9)
+            say(f"labels: {progress.done} of {progress.total}: {counts}, {rate:.1f}/s, {seconds:.0f} s left")
 
     return report
 

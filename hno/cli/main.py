@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import hno
 from hno.cli.arguments import FLAGS, Arguments, UsageError, parse
-from hno.registry import unknown_name
+from hno.registry import UnknownNameError, unknown_name
 
 
 class Command(NamedTuple):
@@ -93,7 +93,7 @@ def main(given: Sequence[str] | None = None, prog: str | None = None) -> int:
     except BrokenPipeError:  # whoever read what is printed has read enough, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
-    except (LookupError, OSError, ValueError) as error:
+    except (UnknownNameError, OSError, ValueError) as error:
         print(error, file=sys.stderr)
         return 2 if isinstance(error, UsageError) else 1
     except KeyboardInterrupt:

@@ -13,10 +13,13 @@ from typing import Any
 import numpy as np
 from lightning.pytorch.loggers import Logger, TensorBoardLogger, WandbLogger
 
-from hno.evaluation.format import number, title
+from hno.evaluation.format import NAMES, number, title
 from hno.evaluation.outcome import pooled
 
 log = logging.getLogger(__name__)
+
+CHOSEN = (*NAMES, "seed", "config_hash")
+"""What TensorBoard shows beside the numbers of a run."""
 
 
 def publish(loggers: Sequence[Logger], results: Mapping[str, Any], folder: Path, step: int) -> None:
@@ -33,6 +36,7 @@ def publish(loggers: Sequence[Logger], results: Mapping[str, Any], folder: Path,
         try:
             logger.log_metrics(numbers(results), step)
             if isinstance(logger, TensorBoardLogger):
+                logger.log_hyperparams({name: str(results.get(name)) for name in CHOSEN}, numbers(results), step)
                 for name, path in pictures.items():
                     from PIL.Image import open as read  # pictures are drawn where it is installed only
 

@@ -18,9 +18,13 @@ class GameSettings(Settings):
 
     @property
     def potential(self) -> bool:
-        """Whether it is a potential game; not where it is unknown, which its first use says."""
-        games = schema.REGISTRIES["game"]()
-        return self.name in games.names() and getattr(games.get(self.name), "potential", False)
+        """Whether it is a potential game; not where it cannot be made, which its first use says."""
+        from hno.games import make  # not at the top: help and completion do without torch
+
+        try:
+            return make(self.name, **self.constants).potential
+        except (LookupError, TypeError, ValueError):
+            return False
 
 
 class Method(Settings):

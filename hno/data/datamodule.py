@@ -112,6 +112,8 @@ class GameData(L.LightningDataModule):
                 "Nothing is trained before collocation begins and after it ends: weigh a supervised term, or set "
                 "data.pretrain and data.finish to 0."
             )
+        if not self.labels.widen or not all(width > 0 for width in self.labels.widen):
+            raise ValueError(f"data.widen must be one or several positive widths; got {self.labels.widen}.")
         sizes = {"trajectories": self.labels.trajectories, "validation": self.labels.validation, **self.batch_sizes}
         for name, size in sizes.items():
             if size is not None and size < 1:

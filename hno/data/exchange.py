@@ -68,7 +68,7 @@ def _certified(game: Game, t: Tensor, x: Tensor, costate: Tensor, value: Tensor,
     shared = torch.full_like(t.expand(len(x), -1), torch.nan)
     if game.potential:  # W is the sum of values, but for penalties that count once
         twice = game.uncontrolled_cost(between, along).sum(-1) - game.potential_cost(between, along)
-        each = torch.from_numpy(simpson(twice.unflatten(-1, (-1, len(share))), dx=1 / 8)) * t.diff()
+        each = torch.from_numpy(simpson(twice.unflatten(-1, (-1, len(share))), dx=1 / (len(share) - 1))) * t.diff()
         shared = value.sum(-1) + torch.nn.functional.pad(each.flip(-1).cumsum(-1).flip(-1), (0, 1))
     return Extremal(
         status=torch.full((len(x),), int(Status.CONVERGED)),

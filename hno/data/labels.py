@@ -18,7 +18,7 @@ from torch import Tensor
 from hno.data.certificates import CLEARANCE, safe
 from hno.data.shards import SHARD, LabelSet
 from hno.data.store import canonical_json
-from hno.data.ties import tie_states
+from hno.data.ties import APART, HALVINGS, TIE, tie_states
 from hno.games import Game
 from hno.pontryagin.solve import Solver, solve
 from hno.types import Extremal, Status, best_of, of_starts, part
@@ -76,10 +76,10 @@ def default_cache() -> Path:
 def start_states(game: Game, request: Request) -> Tensor:
     """Random start states of a request, float64, (starts, P, n); more of them begin with the fewer.
 
-    They are uniform; ties are solved for, and there may be fewer of them.
+    They are uniform, but for ties, which are solved for.
 
     Raises:
-        ValueError: symmetric ones of a game whose players are not interchangeable.
+        ValueError: symmetric ones of a game whose players are not interchangeable, or more ties than are found.
     """
     if request.symmetric and not interchangeable(game):
         raise ValueError(f"Symmetric starts need players of one role; {type(game).__name__} has roles {game.roles}.")
@@ -110,6 +110,8 @@ def provenance(game: Game, request: Request, settings: Solver) -> dict[str, Any]
     """Everything that determines labels, but for how many there are: row k of a set is always the same."""
     content = request._replace(theta=tuple(map(float, request.theta)))._asdict()
     del content["starts"]
+    if request.ties:
+        content["ties"] = [TIE, APART, HALVINGS]
     for name in ("symmetric", "ties", "all_equilibria"):  # keeps the keys of sets that are older than these
         if not content[name]:
             del content[name]

@@ -46,10 +46,10 @@ def tie_states(
         Start states, float64, (count, P, n).
 
     Raises:
-        TooFewTiesError: `MOST` pairs for each do not have so many.
+        TooFewTiesError: `MOST` pairs for each do not have so many; one player has none.
     """
     found, pairs = list[Tensor](), 0
-    while len(found) < count and pairs < MOST * count:
+    while game.players > 1 and len(found) < count and pairs < MOST * count:
         ends = draw(2 * (pairs + BATCH))[2 * pairs :].unflatten(0, (BATCH, 2))
         found += _between(game, theta, ends, settings)
         pairs += BATCH

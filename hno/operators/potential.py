@@ -117,10 +117,6 @@ class PotentialOperator(ValueOperator):
             costate = push.unsqueeze(-3) + share[..., None, None, None] * costate
         return PotentialField(value.unsqueeze(-1), slope.unsqueeze(-1), costate, _chosen(players, branch), branches)
 
-    def branch(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
-        """Which branch is played, (B,), (B, P, n), (B, P) -> (B,)."""
-        return self._functions(tau, x, theta, self._heads(tau, x, theta))[0].argmax(-1)
-
     def _heads(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
         """Raw network outputs, (B, K (1 + P)), by a pure function."""
         y = self.encoding(tau, x)

@@ -1,4 +1,4 @@
-"""Labels where the controller goes wrong, made while it trains (after Nakamura-Zimerer et al. 2021).
+"""Labels where the controller goes wrong, made while it trains (after Nakamura-Zimmerer, Gong and Kang 2021).
 
 A round plays from many states, labels those at which the value that the operator promises differs most from what its
 controller gets, and trains on. Collisions differ most.
@@ -60,9 +60,19 @@ class Adaptive:
     """Times to go at which they are left, as shares of the horizon."""
 
     def steps(self, total: int) -> list[int]:
-        """Steps after which rounds come."""
+        """Steps after which rounds come.
+
+        Raises:
+            ValueError: there are more rounds than steps for them.
+        """
         last = max(1, self.rounds - 1)
-        return [round(total * (self.begin + (self.end - self.begin) * k / last)) for k in range(self.rounds)]
+        due = [round(total * (self.begin + (self.end - self.begin) * k / last)) for k in range(self.rounds)]
+        if len(set(due)) < self.rounds or 0 in due:
+            raise ValueError(
+                f"{self.rounds} rounds of added labels do not fit into {total} steps: train longer, or lower "
+                "data.adaptive.rounds."
+            )
+        return due
 
 
 class Round(NamedTuple):
@@ -80,8 +90,9 @@ class Round(NamedTuple):
     """Those without an equilibrium."""
     inevitable: int
     """Those whose equilibrium collides; they are not trained on."""
-    lost: float
-    """Median over the labelled ones that are trained on of the cost above the equilibrium's, relative to it."""
+    lost: float | None
+    """Median over the labelled ones that are trained on of the cost above the equilibrium's, relative to it; None where
+    there is none."""
     seconds: float
 
 
@@ -96,7 +107,7 @@ class Candidates(NamedTuple):
 
 
 class AdaptiveLabels(L.Callback):
-    """Adds labels to the data of a training, between its steps.
+    """Adds labels to the data of a training, between its steps. It rests where nothing is trained on labels.
 
     Args:
         plan: when and how many.
@@ -120,11 +131,13 @@ class AdaptiveLabels(L.Callback):
         assert isinstance(pl_module, TrainingModule)
         data = getattr(trainer, "datamodule", None)
         if trainer.global_step in self.due and isinstance(data, GameData):
+            if "bvp" not in data.streams:
+                log.info("no labels are added: no loss term reads them")
+                return
             found = self.round(Feedback(pl_module.operator, checked=False), data, trainer.global_step)
             log.info(
-                "round %d: %d of %d episodes collide; %d starts labelled (%d inevitable, %d unsolved), loss %.1f %%",
+                "round %d: %d of %d episodes collide; %d starts labelled, of which %d inevitable and %d unsolved",
                 len(self.done), found.collided, found.candidates, found.labelled, found.inevitable, found.unsolved,
-                100 * found.lost,
             )  # fmt: skip
 
     def round(self, policy: Feedback, data: GameData, step: int) -> Round:
@@ -132,9 +145,9 @@ class AdaptiveLabels(L.Callback):
         began, generator = time.perf_counter(), torch.Generator().manual_seed(mix(step, self.seed, ROUND))
         groups = list(candidates(data.game, policy, self.plan, self.dt, generator))
         played = [judged(policy, group, self.dt) for group in groups]
-        worst = torch.cat([score for score, *_ in played]).topk(min(self.plan.labels, self.plan.candidates)).indices
-        before, found, costs = 0, list[Extremal](), list[Tensor]()
-        chosen = torch.zeros(sum(len(group.x) for group in groups), dtype=torch.bool).index_fill(0, worst, True)
+        gaps, before, found, costs = torch.cat([gap for gap, *_ in played]), 0, list[Extremal](), list[Tensor]()
+        worst = gaps.topk(min(self.plan.labels, len(gaps))).indices
+        chosen = torch.zeros_like(gaps, dtype=torch.bool).index_fill(0, worst, True)
         for group, (_, cost, _) in zip(groups, played, strict=True):
             rows = chosen[before : before + len(group.x)].nonzero().squeeze(-1)
             before += len(group.x)
@@ -144,10 +157,8 @@ class AdaptiveLabels(L.Callback):
         best = [best_of(each) for each in found]
         safe = [sound(each) for each in best]
         assert data.labelled is not None
-        data.labelled.extend(
-            step, [part(each, (each.status == Status.CONVERGED) & (each.clearance > 0)) for each in found]
-        )
-        lost = [(cost.cpu() / b.cost - 1)[s] for cost, b, s in zip(costs, best, safe, strict=True)]
+        data.labelled.extend(step, [part(each, sound(each)) for each in found])
+        lost = torch.cat([(cost / b.cost - 1)[s] for cost, b, s in zip(costs, best, safe, strict=True)])
         unsolved = sum(int((each.status != Status.CONVERGED).sum()) for each in best)
         labelled = sum(len(each.status) for each in best)
         result = Round(
@@ -157,7 +168,7 @@ class AdaptiveLabels(L.Callback):
             labelled=labelled,
             unsolved=unsolved,
             inevitable=labelled - unsolved - sum(int(s.sum()) for s in safe),
-            lost=float(torch.cat(lost).median()) if any(len(part) for part in lost) else 0.0,
+            lost=float(lost.median()) if len(lost) else None,
             seconds=time.perf_counter() - began,
         )
         self.done.append(result)
@@ -203,10 +214,8 @@ def candidates(
         left = max(1, round(share * game.horizon / dt))
         tau, node = left * dt, round(game.horizon / dt) - left
         now, theirs = path.x[number :: len(plan.shares), node].cpu().float(), theta[keep][number :: len(plan.shares)]
-        sound = now.isfinite().flatten(1).all(-1)
-        now, theirs = now[sound], theirs[sound]
-        safe = ~game.violates(now, theirs)
-        yield Candidates(tau, now[safe], theirs[safe])
+        usable = now.isfinite().flatten(1).all(-1) & ~game.violates(now, theirs)
+        yield Candidates(tau, now[usable], theirs[usable])
 
 
 def judged(policy: Feedback, group: Candidates, dt: float) -> tuple[Tensor, Tensor, Tensor]:

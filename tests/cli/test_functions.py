@@ -38,7 +38,7 @@ def registered(monkeypatch: pytest.MonkeyPatch) -> None:
     [
         *((game, "potential") for game in ("narrow_road", "lane_change", "drone", "intersection", "shared")),
         ("walkers", "value"),
-        ("built", "value"),
+        ("built", "potential"),
     ],
 )
 def test_auto_is_the_potential_of_a_game_that_has_one(game: str, function: str) -> None:
@@ -51,8 +51,10 @@ def test_auto_is_the_potential_of_a_game_that_has_one(game: str, function: str) 
 def test_options_of_auto_are_those_of_what_it_stands_for() -> None:
     assert train_settings(["function.exact_terminal=false"]).function == {"name": "potential", "exact_terminal": False}
     assert train_settings(["game=walkers", "function.members=3"]).function["members"] == 3
-    with pytest.raises(ValueError, match=r"function\.members does not exist.*Known: exact_terminal, name\."):
+    with pytest.raises(ValueError, match=r"members is no option of a potential.*choose function=value"):
         train_settings(["function.members=3"])
+    with pytest.raises(ValueError, match=r"function\.members does not exist.*Known: exact_terminal, name\."):
+        train_settings(["function=potential", "+function.members=3"])
 
 
 @pytest.mark.parametrize("function", ["value", "potential"])

@@ -130,3 +130,14 @@ def test_help_whose_reader_has_gone_is_no_traceback(words: str) -> None:
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     done = subprocess.run(command, shell=True, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
     assert done.stderr == ""
+
+
+def test_a_mistake_of_ours_is_no_message(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A missing key somewhere in the package would else end as one quoted word."""
+
+    def broken(given: object) -> int:
+        raise KeyError("operator")
+
+    monkeypatch.setattr("hno.cli.listing.run", broken)
+    with pytest.raises(KeyError):
+        main(["list"])

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from hno.data import GameData
+from hno.data import GameData, LabelPlan
 from hno.data.curriculum import Curriculum
 from hno.data.datamodule import BOX_TYPES
 from hno.data.exchange import write_own
@@ -103,6 +103,12 @@ def test_collocation_ends_with_the_curriculum(make_data: MakeData) -> None:
 def test_nothing_to_train_without_collocation_is_refused(make_data: MakeData, curriculum: Curriculum) -> None:
     with pytest.raises(ValueError, match=r"data\.pretrain and data\.finish to 0"):
         make_data(streams={"interior", "terminal"}, curriculum=curriculum)
+
+
+@pytest.mark.parametrize("widen", [(), (1.0, 0.0), (-2.0,)])
+def test_widths_are_positive_and_there_is_one(widen: tuple[float, ...]) -> None:
+    with pytest.raises(ValueError, match=r"data\.widen must be one or several positive widths"):
+        GameData(make("narrow_road"), {"bvp"}, labels=LabelPlan(widen=widen))
 
 
 def test_batch_sizes(make_data: MakeData) -> None:

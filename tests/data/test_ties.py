@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from hno.data import ties
-from hno.data.labels import Request, start_states
+from hno.data.labels import Request, provenance, start_states
 from hno.data.ties import TIE, TooFewTiesError, tie_states, tied
 from hno.games import make
 from hno.pontryagin.solve import Solver, solve
@@ -85,3 +85,22 @@ def test_a_start_is_tied_by_its_two_cheapest_converged_equilibria() -> None:
     found = of_costs((10.0, 10.05), (10.0, 10.2), (10.0,), (10.2, 20.0, 10.15), (10.0, torch.nan), (10.0, 12.0, 12.01))
     assert tied(found).tolist() == [True, False, False, True, False, False]
     assert tied(of_costs((10.0,), (9.0,))).tolist() == [False, False]
+
+
+def test_one_player_has_no_ties_and_nothing_is_solved() -> None:
+    def draw(size: int) -> Tensor:
+        raise AssertionError("a start was drawn")
+
+    game = Walkers()
+    game.roles = (0,)
+    with pytest.raises(TooFewTiesError, match="has 0 ties"):
+        tie_states(game, (0.0,), 3, draw)
+
+
+def test_sets_of_ties_are_kept_under_what_a_tie_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    game, request = make("narrow_road"), Request((3.0, 3.0), 2, 0, "test", ties=True)
+    before = provenance(game, request, Solver())
+    monkeypatch.setattr("hno.data.labels.TIE", 0.02)
+    assert provenance(game, request, Solver()) != before
+    plain = request._replace(ties=False)
+    assert "ties" not in provenance(game, plain, Solver())["request"]

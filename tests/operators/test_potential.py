@@ -110,6 +110,16 @@ def test_controls_maximise_the_hamiltonian_of_the_team(game: str) -> None:
         assert bool((team.hamiltonian(points.x, costate, u, points.theta) <= best + 1e-9).all())
 
 
+@pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
+def test_the_field_needs_no_gradients_from_outside(mode: Any) -> None:
+    operator = potential_operator("drone")
+    points = random_points(operator.game, 5)
+    wanted = operator.field(points)
+    with mode():
+        for part, other in zip(operator.field(Points(*(column.clone() for column in points))), wanted, strict=True):
+            torch.testing.assert_close(part, other, **TIGHT)
+
+
 def test_torch_transforms_take_the_answer() -> None:
     policy = Feedback(potential_operator("three"))
     points = random_points(policy.game, 5)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import torch
 from torch import Tensor
 
 from hno.control import Feedback
-from hno.data import GameData, LabelPlan
+from hno.data import Collocation, GameData, LabelPlan, make_sampler
 from hno.games import Game, make
 from hno.losses import make_objective
 from hno.operators import ValueOperator
@@ -75,6 +76,45 @@ def test_rounds_are_spread_between_begin_and_end() -> None:
     assert Adaptive(rounds=3, begin=0.4, end=0.8).steps(100) == [40, 60, 80]
     assert Adaptive(rounds=1, begin=0.4).steps(100) == [40]
     assert Adaptive().steps(100) == []
+
+
+@pytest.mark.parametrize(("rounds", "total"), [(2, 1), (9, 4), (1, 1)])
+def test_rounds_that_do_not_fit_are_refused(rounds: int, total: int) -> None:
+    with pytest.raises(ValueError, match=rf"{rounds} rounds of added labels do not fit into {total} steps"):
+        Adaptive(rounds=rounds).steps(total)
+
+
+def test_a_training_without_labels_adds_none(tmp_path: Path, solved: Solved) -> None:
+    made = operator(True)
+    plan, sampler = LabelPlan(types=TYPES, cache=Path("unused")), make_sampler({"box": 1.0})
+    physics = GameData(made.game, {"interior"}, 0, plan, Collocation(sampler), {"interior": 16}, potential=True)
+    found = fit(made, make_objective({"residual": {}}, {"residual": 1.0}), physics, settings(adaptive=PLAN), tmp_path)
+    assert found.rounds == []
+    assert solved.asked == []
+    assert found.trainer.global_step == STEPS
+
+
+def test_a_round_labels_no_more_states_than_it_has(solved: Solved) -> None:
+    labelled = data(True)
+    labelled.setup("fit")
+    policy, plan = (
+        Feedback(potential_operator("narrow_road").float(), checked=False),
+        replace(PLAN, labels=400, candidates=400),
+    )
+    found = AdaptiveLabels(plan, STEPS, 0, 0.1, workers=1).round(policy, labelled, 2)
+    assert found.labelled == found.candidates < plan.candidates  # some of these are in the violation set
+
+
+def test_labels_that_collide_are_counted_and_not_trained_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    def colliding(game: Game, x0: Tensor, theta: Tensor, *arguments: Any, **options: Any) -> Extremal:
+        return fake_solve(game, x0, theta, **options)._replace(clearance=torch.full((len(x0),), -0.1).double())
+
+    monkeypatch.setattr(module, "solve", colliding)
+    labelled = data(True)
+    labelled.setup("fit")
+    policy = Feedback(potential_operator("narrow_road").float(), checked=False)
+    found = AdaptiveLabels(PLAN, STEPS, 0, 0.1, workers=1).round(policy, labelled, 2)
+    assert (found.inevitable, found.lost, labelled.labelled.added) == (PLAN.labels, None, [])
 
 
 @pytest.mark.parametrize("potential", [False, True])
