@@ -1,10 +1,11 @@
-"""How far a label's costates are from the gradient of the equilibrium value over start states.
+"""How far a label's costates are from the gradient of the equilibrium value, and of the potential, over start states.
 
-    python benchmarks/costates.py [--games narrow_road lane_change drone] [--starts 100]
+    python benchmarks/costates.py [--games narrow_road lane_change drone intersection] [--starts 100]
 
 An open-loop costate is the gradient of V_i at everybody's *fixed* controls. The total derivative also holds the
 others' answer to a changed start, which is not zero in a general-sum game. It is taken here by central differences:
-the equilibrium of the shifted start is reached by Newton from the solved one, so that it stays in its family.
+the equilibrium of the shifted start is reached by Newton from the solved one, so that it stays in its family. Own
+costates are compared with the gradient of the potential W as well.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import torch
 from torch import Tensor
 
 from hno.games import Game, make
+from hno.games.potential import Team
 from hno.pontryagin.collocation import Collocation, Iterate
 from hno.pontryagin.newton import Newton, newton
 from hno.pontryagin.solve import along_mesh, solve_on_mesh
@@ -25,12 +27,13 @@ from hno.types import Status
 
 
 def shifted_values(game: Game, at: Iterate, shift: Tensor) -> Tensor:
-    """V_i at equilibria of shifted starts, NaN where Newton does not converge, (B, P)."""
+    """V_i and, behind them, W at equilibria of shifted starts, NaN where Newton does not converge, (B, P + 1)."""
     start = at._replace(z=at.z.clone())
     start.z[:, 0, : shift.numel()] += shift.flatten()
     found = newton(Collocation(game), start, Newton())
     reached = start._replace(z=found.z)
-    value = values(game, at.t, *along_mesh(game, reached), at.theta)[:, 0]
+    path = along_mesh(game, reached)
+    value = torch.cat([values(problem, at.t, *path, at.theta)[:, 0] for problem in (game, Team(game))], -1)
     return torch.where((found.status == Status.CONVERGED).unsqueeze(-1), value, torch.nan)
 
 
@@ -48,13 +51,17 @@ def compare(name: str, starts: int, step: float = 1e-4) -> dict[str, Any]:
         for shift in torch.eye(width.numel(), dtype=x0.dtype) * step:
             both = [shifted_values(game, at, sign * shift.view_as(width) * width) for sign in (1, -1)]
             slopes.append((both[0] - both[1]) / (2 * step))
-    total = torch.stack(slopes, -1).unflatten(-1, width.shape)
+    slopes_of = torch.stack(slopes, -1).unflatten(-1, width.shape)
+    total = slopes_of[:, :-1]
     fixed = costate * width
     good = (found.status == Status.CONVERGED) & total.isfinite().all((1, 2, 3))
     own = torch.eye(game.players, dtype=torch.bool)
     error, size = (total - fixed)[good], fixed[good].square().sum((-1, -2, -3)).sqrt()
     parts = {"own": error[:, own], "cross": error[:, ~own], "all": error.flatten(1, 2)}
     relative = {part: values_.square().sum((-1, -2)).sqrt() / size for part, values_ in parts.items()}
+    of_own = fixed[good][:, own]
+    potential = (slopes_of[good][:, -1] - of_own).square().sum((-1, -2)).sqrt()
+    relative["W"] = potential / of_own.square().sum((-1, -2)).sqrt()
     shares = torch.tensor([0.5, 0.9], dtype=x0.dtype)
     return {
         "game": name,
@@ -67,14 +74,14 @@ def compare(name: str, starts: int, step: float = 1e-4) -> dict[str, Any]:
 def main() -> None:
     """Print the table and one JSON object."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--games", nargs="+", default=["narrow_road", "lane_change", "drone"])
+    parser.add_argument("--games", nargs="+", default=["narrow_road", "lane_change", "drone", "intersection"])
     parser.add_argument("--starts", type=int, default=100)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    print("game          compared   own: median, 90 %     cross: median, 90 %   all: median, 90 %")
+    print("Of V_i: own, cross and all costates; of W: own costates. Medians and 90 % quantiles of relative errors.")
     rows = [compare(name, arguments.starts) for name in arguments.games]
     for row in rows:
-        cells = "".join(f"{row[part][0]:12.3f}{row[part][1]:10.3f}" for part in ("own", "cross", "all"))
+        cells = "".join(f"   {part} {row[part][0]:.2g}, {row[part][1]:.2g}" for part in ("own", "cross", "all", "W"))
         print(f"{row['game']:14}{row['compared']:5} of {row['starts']}{cells}")
     print(json.dumps({"games": rows}))
 
