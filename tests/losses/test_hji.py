@@ -7,8 +7,9 @@ import torch
 from torch import Tensor
 
 from hno.games import make
+from hno.games.potential import Team
 from hno.losses import Scales, View, hji_residual, losses
-from hno.types import Field, Points, Sample
+from hno.types import Field, Points, PotentialField, Sample
 from tests.lq import LinearQuadratic, feedback_riccati_rate, quadratic, random_game
 
 
@@ -154,3 +155,18 @@ def test_any_batch_shape_of_points():
     grid_points = Points(*(part.unflatten(0, (4, 8)) for part in at))
     grid = hji_residual(game, grid_points, Field(*(part.unflatten(0, (4, 8)) for part in field[:3])))
     torch.testing.assert_close(grid.flatten(0, 1), flat)
+
+
+def test_the_potential_of_uncoupled_regulators_is_the_sum_of_their_values() -> None:
+    """W = V_1 + V_2 meets the one scalar equation, and neither V_1 alone nor W of another rate does."""
+    game = regulators()
+    game.potential = True
+    at, team = points(game), Team(game)
+    of_players = regulator_field(at)
+    own = of_players.costate.diagonal(dim1=-3, dim2=-2).mT.unsqueeze(-3)
+    total, rate = (part.sum(-1, keepdim=True) for part in (of_players.value, of_players.dvalue_dtau))
+    field = PotentialField(total, rate, own, of_players.value, total)
+    assert float(hji_residual(team, at, field).abs().max()) < 1e-9
+    assert float(hji_residual(team, at, field._replace(dvalue_dtau=0.9 * rate)).abs().max()) > 0.1
+    one = own * torch.tensor([[1.0], [0.0]])
+    assert float(hji_residual(team, at, field._replace(costate=one)).abs().max()) > 0.1

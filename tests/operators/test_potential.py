@@ -110,6 +110,20 @@ def test_controls_maximise_the_hamiltonian_of_the_team(game: str) -> None:
         assert bool((team.hamiltonian(points.x, costate, u, points.theta) <= best + 1e-9).all())
 
 
+def test_few_and_many_branch_inputs_give_the_same_values(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One product for all of them, or a look-up for each row."""
+    operator = potential_operator("narrow_road").requires_grad_()
+    points = random_points(operator.game, 9)
+    found = []
+    for limit in (10**6, 0):
+        monkeypatch.setattr("hno.operators.deeponet.TABLE", limit)
+        field = operator.field(points)
+        gradient = torch.autograd.grad(field.branches.sin().sum() + field.players.cos().sum(), operator.parameters())
+        found.append((field.branches, field.players, *gradient))
+    for one, other in zip(*found, strict=True):
+        torch.testing.assert_close(one, other, **TIGHT)
+
+
 @pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
 def test_the_field_needs_no_gradients_from_outside(mode: Any) -> None:
     operator = potential_operator("drone")
