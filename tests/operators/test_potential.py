@@ -49,6 +49,7 @@ def test_the_field_holds_the_derivatives_of_the_potential(game: str, exact: bool
     value = potential(operator, Points(tau, x, theta))
     rate, costate = torch.autograd.grad(value.sum(), (tau, x))
     torch.testing.assert_close(field.value.squeeze(-1), value.detach(), **TIGHT)
+    torch.testing.assert_close(field.players, operator.value(tau, x, theta).detach(), **TIGHT)
     torch.testing.assert_close(field.dvalue_dtau.squeeze(-1), rate, **TIGHT)
     torch.testing.assert_close(field.costate.squeeze(-3), costate, **TIGHT)
 
