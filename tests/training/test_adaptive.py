@@ -21,7 +21,7 @@ from hno.training import adaptive as module
 from hno.training import fit
 from hno.training.adaptive import Adaptive, AdaptiveLabels, candidates, judged
 from hno.training.fit import LAST
-from hno.types import Extremal, PotentialLabels
+from hno.types import Extremal, PotentialLabels, Trajectory
 from tests.fakes import fake_labels, fake_solve
 from tests.operators.conftest import small_operator
 from tests.operators.test_potential import potential_operator
@@ -180,6 +180,23 @@ def test_candidates_are_safe_states_with_the_rest_of_the_game_to_go() -> None:
     spread = groups[0].x.flatten(0, 1).amax(0) - groups[0].x.flatten(0, 1).amin(0)
     assert bool((spread > 0.9 * game.state_box.width[0]).all())  # anywhere in the PDE box
     assert len(groups[0].theta.unique(dim=0)) <= 16
+
+
+def test_an_episode_is_left_when_its_time_to_go_is_that_of_the_candidates(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Episodes in which a speed says how many controls were held so far."""
+
+    def counting(game: Game, policy: Any, x0: Tensor, theta: Tensor, dt: float, **options: Any) -> Trajectory:
+        steps = round(game.horizon / dt)
+        x = x0.unsqueeze(1).repeat(1, steps + 1, 1, 1)
+        x[..., 3] = torch.arange(steps + 1).float().view(1, -1, 1)
+        empty = torch.empty(0)
+        return Trajectory(dt * torch.arange(steps + 1), x, empty, empty, empty, empty)
+
+    monkeypatch.setattr(module, "rollout", counting)
+    game, policy = make("narrow_road"), Feedback(potential_operator("narrow_road").float(), checked=False)
+    _, *left = candidates(game, policy, Adaptive(candidates=64), 0.1, torch.Generator().manual_seed(0))
+    for group in left:
+        assert group.x[..., 3].unique().tolist() == [round((game.horizon - group.tau) / 0.1)]
 
 
 def test_the_states_that_are_labelled_are_those_that_disappoint_most(solved: Solved) -> None:
