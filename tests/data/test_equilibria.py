@@ -11,7 +11,7 @@ from torch import Tensor
 from hno.data import GameData, LabelPlan, shards
 from hno.data import datamodule as module
 from hno.data import labels as label_data
-from hno.data.labels import Request, label_set, labels_for, start_states
+from hno.data.labels import Progress, Request, label_set, labels_for, start_states
 from hno.data.shards import MANIFEST, LabelSet
 from hno.data.store import start_count
 from hno.games import Game, make
@@ -185,3 +185,11 @@ def test_the_shape_of_a_fake_with_several_equilibria_is_that_of_labels() -> None
     found, plain = expected(5), fake_labels(make("narrow_road"))
     for name, ours, theirs in zip(Extremal._fields, found, plain, strict=True):
         assert ours.shape[1:] == theirs.shape[1:], name
+
+
+def test_progress_counts_starts_not_equilibria(tmp_path: Path, solved: list[Tensor]) -> None:
+    told: list[Progress] = []
+    found, _ = labels_for(make("narrow_road"), [REQUEST], tmp_path, workers=1, report=told.append)
+    assert len(found[0].status) > REQUEST.starts
+    assert [progress.done for progress in told] == [8, 16, 20]
+    assert all(progress.converged == progress.done for progress in told)

@@ -9,7 +9,8 @@ from torch import Tensor
 from hno.cli.sections import show
 from hno.control.rollout import Disturbance, rollout
 from hno.evaluation.closed_loop import CollisionTable, TypeRow, verdict
-from hno.types import Extremal, Field, Points, Status
+from hno.games.base import own_costate
+from hno.types import Extremal, Field, Points, PotentialField, Status
 from tests.fakes import fake_labels, played_table
 from tests.walkers import Walkers
 
@@ -173,6 +174,19 @@ def test_errors_are_weighted_over_the_nodes_of_converged_labels() -> None:
     torch.testing.assert_close(asked[0].tau, (1 - found.t).repeat(2).float())
     assert row.value_error == pytest.approx(0.1, rel=1e-5)
     assert row.costate_error == pytest.approx(0.1 / found.costate[:2].abs().mean().item(), rel=1e-5)
+
+
+def test_errors_of_a_potential_are_those_of_players_values_and_own_costates() -> None:
+    found = labelled([0.9, 0.7], [0.5, 0.5])
+
+    def field(points: Points) -> PotentialField:
+        value, own = found.value.flatten(0, 1).float(), own_costate(found.costate.flatten(0, 1)).float()
+        nobody = points.theta[:, :1]
+        return PotentialField(nobody, nobody, own.unsqueeze(1) + 0.1, 0.9 * value, nobody)
+
+    (row,) = played_table(Walkers(), straight, [found], seen=[], field=field)
+    assert row.value_error == pytest.approx(0.1, rel=1e-5)
+    assert row.costate_error == pytest.approx(0.1 / own_costate(found.costate).abs().mean().item(), rel=1e-5)
 
 
 def test_without_a_label_there_are_no_errors() -> None:

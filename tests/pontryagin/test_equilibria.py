@@ -12,6 +12,7 @@ from torch import Tensor
 from hno.data.labels import Request, start_states
 from hno.games import make
 from hno.games.potential import Team
+from hno.pontryagin.newton import Newton
 from hno.pontryagin.solve import Solver, solve
 from hno.types import Extremal, Status, best_of, join, of_starts, part
 from tests.crossing import Merging, Nearest
@@ -81,6 +82,18 @@ def test_a_game_that_says_wrongly_that_it_has_a_potential_is_refused_before_anyt
     x0 = game.initial_box.sample(2, torch.Generator().manual_seed(0))
     with pytest.raises(ValueError, match=r"Claimed misses by .* set `potential = False`"):
         solve(game, x0, torch.ones(2, 3))
+
+
+def test_where_nothing_converges_the_attempt_is_the_one_that_comes_closest() -> None:
+    """Which here, for one state, is not the one that the search found the cheapest."""
+    game, theta = make("lane_change"), torch.tensor([[5.0, 5.0]]).expand(2, -1)
+    x0 = start_states(game, Request((5.0, 5.0), 2, 3, "train"))
+    hasty = Solver(newton=Newton(steps=1, reuses=0, full_steps=0))
+    one, every = (solve(game, x0, theta, hasty, all_equilibria=each) for each in (False, True))
+    assert Status.CONVERGED not in one.status.tolist()
+    assert every.start.tolist() == [0, 1]
+    assert torch.equal(one.residual, every.residual)
+    assert torch.equal(one.x, every.x)
 
 
 class Unsolvable(Merging):
