@@ -9,7 +9,7 @@ import threading
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal, final
+from typing import Annotated, Any, Literal, final
 
 import torch
 from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, ValidationError
@@ -74,9 +74,11 @@ class _TrainingState(BaseModel):
     loops: dict[str, Any]
     optimizer_states: list[dict[Literal["state", "param_groups"], Any]] = Field(min_length=1, max_length=1)
     lr_schedulers: list[dict[str, Any]]
-    callbacks: dict[str, dict[str, Any]]
+    callbacks: dict[str, Annotated[dict[str, Any], Field(min_length=1)]]
 
 
+_LOOPS = {"epoch_loop.automatic_optimization.optim_progress", "epoch_loop.batch_progress", "epoch_progress"}
+"""What Lightning needs to know where a training was."""
 LONGEST = 1000
 """Characters that a text in the record may have."""
 
@@ -121,6 +123,11 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
     found = content.get(KEY)
     if not isinstance(found, dict) or not isinstance(content.get("state_dict"), dict):
         raise CheckpointError(f"{path} was not written by hno: its entry {KEY!r} is missing.")
+    try:
+        if not all(map(_plain, leaves(found))):
+            raise ValueError("it holds more than short texts and finite numbers")
+    except UNFIT as error:
+        raise CheckpointError(f"{path} has a bad entry {KEY!r}: {reason(error)}. Train it again.") from error
     if found.get("format") != FORMAT:
         version = reason(ValueError(found.get("format")))
         raise CheckpointError(
@@ -129,8 +136,6 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
     if missing := sorted(_Record.model_fields.keys() - found.keys()):
         raise CheckpointError(f"{path} is not complete: its entry {KEY!r} lacks {', '.join(missing)}. Train it again.")
     try:
-        if not all(map(_plain, leaves(found))):
-            raise ValueError("it holds more than short texts and finite numbers")
         if _Record.model_validate(found).model_dump() != found:
             raise ValueError("an entry has another type")
     except UNFIT as error:
@@ -184,7 +189,10 @@ def check_training_state(path: str | Path, content: Mapping[str, Any], steps: in
     try:
         state = _TrainingState.model_validate(content)
         step, (optimizer,) = state.global_step, state.optimizer_states
-        progress = state.loops["fit_loop"]["epoch_loop.automatic_optimization.optim_progress"]
+        loops = state.loops["fit_loop"]
+        if missing := sorted(_LOOPS - loops.keys()):
+            raise ValueError(f"its loops lack {', '.join(missing)}")
+        progress = loops["epoch_loop.automatic_optimization.optim_progress"]
         if progress["optimizer"]["step"]["total"]["completed"] != step:
             raise ValueError("its step is not that of its loops")
         trained = [number for group in optimizer["param_groups"] for number in group["params"]]

@@ -34,7 +34,9 @@ UNTRAINED = {
     "global_step": 0,
     "loops": {
         "fit_loop": {
-            "epoch_loop.automatic_optimization.optim_progress": {"optimizer": {"step": {"total": {"completed": 0}}}}
+            "epoch_loop.automatic_optimization.optim_progress": {"optimizer": {"step": {"total": {"completed": 0}}}},
+            "epoch_loop.batch_progress": {},
+            "epoch_progress": {},
         }
     },
     "optimizer_states": [{"state": {}, "param_groups": [{"params": [0]}]}],
