@@ -7,6 +7,7 @@ import hashlib
 import io
 import os
 import pickle
+import pickletools
 import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -113,7 +114,7 @@ def remove_drafts(folder: Path) -> None:
     """Remove what a killed process was writing in a folder that nobody else writes to."""
     for name in (BEST, LAST):
         for draft in folder.glob(f".{name}.*"):
-            draft.unlink()
+            draft.unlink(missing_ok=True)
 
 
 def read_content(path: Path) -> dict[str, Any]:
@@ -126,10 +127,13 @@ def read_content(path: Path) -> dict[str, Any]:
     try:
         with zipfile.ZipFile(io.BytesIO(whole)) as archive:
             entries = archive.infolist()
-        if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
-            raise ValueError("its entries are compressed")
-        if sum(entry.file_size for entry in entries) > len(whole):
-            raise ValueError("its entries are larger than the file")
+            if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
+                raise ValueError("its entries are compressed")
+            if sum(entry.file_size for entry in entries) > len(whole):
+                raise ValueError("its entries are larger than the file")
+            for entry in entries:
+                if entry.filename.endswith(".pkl"):
+                    _check_tuples(archive.read(entry))
         content = torch.load(io.BytesIO(whole), map_location="cpu", weights_only=True)
         for item in leaves(content):
             if isinstance(item, Tensor):
@@ -162,6 +166,39 @@ def leaves(content: Any) -> Iterator[Any]:
         if depth >= DEEPEST or entries > MOST:
             raise ValueError(f"its content has more than {DEEPEST} levels or {MOST} entries")
         stack.extend((part, depth + 1) for part in parts)
+
+
+def _check_tuples(pickled: bytes) -> None:
+    """Refuse a pickle with tuples of too many levels or entries, without unpickling it.
+
+    Where such a tuple is the key of a dictionary, its hash takes for ever or more stack than there is.
+
+    Raises:
+        ValueError: it has; or it is no pickle.
+    """
+    mark = (-1, 0)
+    stack, memo = list[tuple[int, int]](), dict[Any, tuple[int, int]]()
+    for operation, argument, _ in pickletools.genops(pickled):
+        name, taken, before = operation.name, list[tuple[int, int]](), list(operation.stack_before)
+        if pickletools.markobject in before:
+            while (top := stack.pop()) != mark:
+                taken.append(top)
+            before = before[: before.index(pickletools.markobject)]
+        for _ in before:
+            taken.append(stack.pop())
+        depth = 1 + max((deep for deep, _ in taken), default=0)
+        size = 1 + sum(size for _, size in taken)
+        if name.startswith("TUPLE") and (depth > DEEPEST or size > MOST):
+            raise ValueError(f"a tuple has more than {DEEPEST} levels or {MOST} entries")
+        if "GET" in name:
+            stack.append(memo[argument])
+        elif "PUT" in name or name == "MEMOIZE":
+            memo[len(memo) if name == "MEMOIZE" else argument] = taken[-1] if taken else stack[-1]
+            stack += taken
+        elif name.startswith("TUPLE") or not before:
+            stack += [mark if each is pickletools.markobject else (depth, size) for each in operation.stack_after]
+        else:  # a container that gets more entries is not one level deeper for each of them
+            stack += [(max(taken[-1][0], *(1 + deep for deep, _ in taken[:-1]), 0), size)] * len(operation.stack_after)
 
 
 def not_finite(content: Mapping[str, Any]) -> str | None:

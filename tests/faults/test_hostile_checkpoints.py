@@ -154,6 +154,11 @@ def test_deep_nesting_and_shared_parts_are_refused(tmp_path: Path) -> None:
         path.write_bytes(bomb)
         with little_memory(), pytest.raises(CheckpointError, match="more than 32 levels or 1000000 entries"):
             load_operator(path)
+    towers = b"\x85" * 10**6, b"".join(b"q" + bytes([i]) + b"h" + bytes([i]) + b"\x86" for i in range(100))
+    for tower in towers:  # as the key of a dictionary: hashing it would need a stack as deep, or 2^100 steps
+        path.write_bytes(archive(b"\x80\x02})" + tower + b"K\x01s."))
+        with pytest.raises(CheckpointError, match="a tuple has more than 32 levels or 1000000 entries"):
+            load_operator(path)
     for kind in (lambda inner: [inner], lambda inner: {"a": inner}):
         refused(path, operator_content(constants={"radius": nested(200, kind)}))
         refused(path, operator_content() | {"callbacks": nested(200, kind)})
