@@ -212,7 +212,8 @@ def same_run(one: Path, other: Path) -> bool:
     if not one.exists():
         return False
     try:
-        if read_content(one).get(KEY) == read_content(other).get(KEY):
+        found, wanted = (read_content(path).get(KEY) for path in (one, other))
+        if all(map(_plain, leaves([found, wanted]))) and found == wanted:
             return True
     except CheckpointError as error:
         log.warning("%s The run goes on from %s.", error, other)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import lightning as L
 import pytest
+import torch
 
 from hno.cli.train import _take_over as take_over
 from hno.training.checkpoint import find_checkpoint, same_run
@@ -23,7 +24,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-@pytest.mark.parametrize("what", ["another seed", "another width", "empty", "truncated"])
+@pytest.mark.parametrize("what", ["another seed", "another width", "another record", "empty", "truncated"])
 def test_a_best_checkpoint_that_is_not_of_the_run_is_not_used(
     folder: Path, caplog: pytest.LogCaptureFixture, what: str
 ) -> None:
@@ -35,6 +36,8 @@ def test_a_best_checkpoint_that_is_not_of_the_run_is_not_used(
         record["provenance"]["seed"] += 1
     if what == "another width":
         record["architecture"]["network"]["options"]["width"] += 1
+    if what == "another record":
+        record["format"] = torch.zeros(2)
     best.write_bytes({"empty": b"", "truncated": whole[:-9]}.get(what, seal(content)))
     found = run(folder, resume=last)
     assert (found.best, found.checkpoint) == (None, last)
