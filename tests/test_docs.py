@@ -15,12 +15,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
-import torch
 
 from hno.cli.main import main
 from hno.games import make
 from hno.operators import Architecture, make_operator
 from hno.training.checkpoint import Provenance, record
+from hno.training.saving import seal
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -146,7 +146,8 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A narrow-road operator with random weights, as training would have saved it."""
     game, path = make("narrow_road"), tmp_path_factory.mktemp("run") / "best.ckpt"
     kept = record(game, Architecture(), Provenance(types=[(1.0, 1.0)]))
-    torch.save({"state_dict": {f"operator.{n}": w for n, w in make_operator(game).state_dict().items()}, **kept}, path)
+    weights = {f"operator.{name}": weight for name, weight in make_operator(game).state_dict().items()}
+    path.write_bytes(seal({"state_dict": weights, **kept}))
     return path
 
 

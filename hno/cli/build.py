@@ -21,8 +21,9 @@ from hno.losses import Objective, make_objective
 from hno.operators import Architecture, Choice, ValueOperator, make_operator
 from hno.training.adaptive import Adaptive
 from hno.training.checkpoint import find_checkpoint
-from hno.training.fit import LAST, Settings
+from hno.training.fit import Settings
 from hno.training.optimizers import make_optimizer
+from hno.training.saving import RESUMED
 
 
 class Built(NamedTuple):
@@ -52,7 +53,7 @@ def check(config: DictConfig) -> TrainSettings:
         if settings.evaluation.ntk:
             check_rows(built.operator, settings.evaluation.ntk_rows)
     if settings.resume is not None:
-        find_checkpoint(settings.resume, [LAST])
+        find_checkpoint(settings.resume, RESUMED)
     return settings
 
 

@@ -23,10 +23,11 @@ from hno.data.certificates import safe_sets, summaries
 from hno.data.datamodule import GameData
 from hno.data.labels import Request, default_cache, safe_labels_for
 from hno.games.grid import parse_types
-from hno.training.checkpoint import Provenance, check_resumable, find_checkpoint, load_policy, record
+from hno.training.checkpoint import Provenance, check_resumable, find_checkpoint, load_policy, record, same_run
 from hno.training.divergence import DivergedError
-from hno.training.fit import LAST, Fitted, fit
-from hno.training.validation import BEST, PROBE, Later
+from hno.training.fit import Fitted, fit
+from hno.training.saving import BEST, RESUMED
+from hno.training.validation import PROBE, Later
 from hno.types import Extremal
 
 log = logging.getLogger(__name__)
@@ -72,10 +73,10 @@ def train_operator(settings: TrainSettings, folder: Path, results: Results) -> F
     architecture, operator, objective, data = build(settings, label_progress())
     origin = Provenance(settings.operator.name, data.type_list, settings.seed, config_hash(settings))
     entries, makers = record(data.game, architecture, origin), loggers(settings, folder)
-    resume = None if settings.resume is None else find_checkpoint(settings.resume, [LAST])
+    resume = None if settings.resume is None else find_checkpoint(settings.resume, RESUMED)
     if resume is not None:
-        check_resumable(resume, entries)
-    _take_over(None if resume is None else resume.parent / BEST, folder / BEST)
+        check_resumable(resume, entries, settings.trainer.max_steps)
+    _take_over(resume, folder / BEST)
 
     data.setup("fit")
     results.time("labels", data.label_seconds)
@@ -91,7 +92,6 @@ def train_operator(settings: TrainSettings, folder: Path, results: Results) -> F
     except DivergedError:
         if (folder / BEST).exists():
             results.update(checkpoint=BEST)
-            log.error("The last good checkpoint is %s.", folder / BEST)
         raise
     solving = results.content["seconds"].get("validation_labels", 0.0) - before  # while validation played
     results.time("training", fitted.seconds["training"])
@@ -131,9 +131,9 @@ def validation_starts(settings: TrainSettings, data: GameData, results: Results)
     return first, None if choice.starts <= PROBE else later
 
 
-def _take_over(best: Path | None, to: Path) -> None:
+def _take_over(resume: Path | None, to: Path) -> None:
     """Go on from the best checkpoint of the run that is resumed; one of another run in our folder goes."""
-    if best is None or not best.exists():
+    if resume is None or not same_run(best := resume.with_name(BEST), resume):
         to.unlink(missing_ok=True)
     elif best.resolve() != to.resolve():
         shutil.copy2(best, to)

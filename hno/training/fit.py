@@ -19,17 +19,17 @@ from hno.data.certificates import safe_sets
 from hno.losses import Objective, Scales
 from hno.operators import ValueOperator
 from hno.training.adaptive import Adaptive, AdaptiveLabels, Round
+from hno.training.checkpoint import check_training_state, same_run
 from hno.training.divergence import StopOnDivergence
 from hno.training.module import TrainingModule
 from hno.training.optimizers import make_optimizer
 from hno.training.polish import polish
-from hno.training.validation import BEST, ClosedLoopValidation, Later, Score
+from hno.training.saving import BEST, LAST, UNFIT, CheckpointError, CheckpointFiles, read_content, reason, remove_drafts
+from hno.training.validation import ClosedLoopValidation, Later, Score
 from hno.types import Extremal
 
 log = logging.getLogger(__name__)
 
-LAST = "last.ckpt"
-"""Name of the latest checkpoint inside a run's folder."""
 LONG = 20_000
 """Steps from which on compiling pays: it takes some ten seconds and saves about a millisecond a step."""
 
@@ -92,7 +92,7 @@ def fit(
     callbacks: Sequence[L.Callback] = (),
     resume: Path | None = None,
 ) -> Fitted:
-    """Train an operator; the folder gets `last.ckpt` and, with closed-loop validation, `best.ckpt`.
+    """Train an operator; the folder gets `last.ckpt`, `previous.ckpt` and, with closed-loop validation, `best.ckpt`.
 
     Args:
         operator: changed in place.
@@ -109,7 +109,8 @@ def fit(
         resume: a checkpoint of the same run to go on from.
 
     Raises:
-        DivergedError: the loss, or the error on held-out labels, is no longer sound.
+        DivergedError: the loss, a gradient, a weight, or the error on held-out labels is no longer sound.
+        CheckpointError: the training cannot go on from the checkpoint.
     """
     if data.potential != operator.potential:
         raise ValueError(
@@ -130,8 +131,17 @@ def fit(
     plan = data.labels
     adding = AdaptiveLabels(settings.adaptive, settings.steps, data.seed, settings.dt, plan.solver, plan.workers)
     trainer = make_trainer(settings, folder, loggers, [adding, watch, *callbacks], validates=data.val_rows is not None)
+    remove_drafts(folder)
+    if resume is not None:
+        check_training_state(resume, read_content(resume), settings.steps)
+        watch.resumes = same_run(folder / BEST, resume)
     began = time.perf_counter()
-    trainer.fit(module, datamodule=data, ckpt_path=resume, weights_only=True)
+    try:
+        trainer.fit(module, datamodule=data, ckpt_path=resume, weights_only=True)
+    except UNFIT as error:
+        if resume is None or module.began:
+            raise
+        raise CheckpointError(f"{resume} does not fit this run: {reason(error)}") from error
     if settings.polish:
         before, after = polish(module, data.large_batch(trainer.global_step), settings.polish)
         log.info("L-BFGS: loss %.4g, was %.4g", after, before)
@@ -153,7 +163,7 @@ def make_trainer(
     settings: Settings, folder: Path, loggers: Sequence[Logger], callbacks: Sequence[L.Callback], *, validates: bool
 ) -> L.Trainer:
     """A trainer that runs for a number of steps and leaves `last.ckpt`; it validates where there are held-out rows."""
-    every = settings.validate_every
+    every, files = settings.validate_every, CheckpointFiles()
     keeping_last = ModelCheckpoint(
         folder, Path(LAST).stem, every_n_train_steps=every, save_on_train_epoch_end=False, enable_version_counter=False
     )
@@ -170,7 +180,8 @@ def make_trainer(
         num_sanity_val_steps=0,
         log_every_n_steps=max(1, min(50, settings.steps)),
         logger=list(loggers) or False,
-        callbacks=[StopOnDivergence(min(50, every)), *callbacks, keeping_last],
+        callbacks=[StopOnDivergence(folder, files), *callbacks, keeping_last],
+        plugins=[files],
         enable_progress_bar=any(isinstance(callback, ProgressBar) for callback in callbacks),
         enable_model_summary=False,
         default_root_dir=folder,

@@ -38,10 +38,15 @@ class TrainingModule(L.LightningModule):
     ) -> None:
         super().__init__()
         self.operator, self.objective, self.optimizer, self.record = operator, objective, optimizer, record or {}
+        self.began = False
         self.terms = objective.used(exact_terminal=operator.meets_terminal)
         self.streams = objective.streams(exact_terminal=operator.meets_terminal)
         self.value_error = WeightedMeanAbsolutePercentageError()
         self.costate_error = WeightedMeanAbsolutePercentageError()
+
+    def on_train_start(self) -> None:
+        """From here on a checkpoint to go on from has been restored."""
+        self.began = True
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Weighted sum of the terms whose stream is in the batch; the others are logged as NaN."""

@@ -16,12 +16,11 @@ from hno.control.policy import Feedback
 from hno.control.rollout import rollout
 from hno.data import GameData
 from hno.training.module import TrainingModule
+from hno.training.saving import BEST
 from hno.types import Extremal, Trajectory, join, part
 
 log = logging.getLogger(__name__)
 
-BEST = "best.ckpt"
-"""Name of the best checkpoint inside a run's folder."""
 PROBE = 8
 """Starts per type that are played first, by default."""
 FEW = 4
@@ -95,6 +94,7 @@ class ClosedLoopValidation(L.Callback):
         self.all: Starts | None = None
         self.later: Later | None = None
         self.best: Score | None = None
+        self.resumes = True
         self.seconds = 0.0
 
     def begin(self, labels: Sequence[Extremal], later: Later | None = None) -> None:
@@ -163,5 +163,5 @@ class ClosedLoopValidation(L.Callback):
         return {"best": None if self.best is None else list(self.best)}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Go on from it, where the checkpoint that it belongs to is there."""
-        self.best = Score(*state_dict["best"]) if state_dict["best"] and self.path.exists() else None
+        """Go on from it, where the checkpoint that it belongs to is there and is to be used (`resumes`)."""
+        self.best = Score(*state_dict["best"]) if state_dict["best"] and self.resumes and self.path.exists() else None

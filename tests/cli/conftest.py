@@ -18,6 +18,7 @@ from hno.data import datamodule
 from hno.games import Game, make
 from hno.operators import make_operator
 from hno.training.checkpoint import Provenance, record
+from hno.training.saving import seal
 from tests.fakes import small_architecture
 
 SMOKE = ("experiment=smoke", "data.types=[[1,1]]", "data.workers=1", "evaluation.dt=0.1")
@@ -130,5 +131,5 @@ def save_random(path: Path, game: Game | None = None, method: str = "hno", seed:
     origin = Provenance(method, list(dict.fromkeys([(1.0, 1.0), (also, also)])), 0, "any")
     path.parent.mkdir()
     content = {"state_dict": {f"operator.{name}": weight for name, weight in weights.items()}}
-    torch.save(content | record(game, architecture, origin), path)
+    path.write_bytes(seal(content | record(game, architecture, origin)))
     return path

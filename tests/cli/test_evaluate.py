@@ -18,6 +18,7 @@ from hno.evaluation import closed_loop
 from hno.evaluation.residuals import REGIONS
 from hno.games import Game, make
 from hno.games.base import ExtrapolationWarning
+from hno.training.saving import seal
 from hno.types import Trajectory
 from tests.cli.conftest import SMOKE, Command, refused, save_random
 
@@ -156,7 +157,7 @@ def test_the_game_of_a_script_is_registered_by_importing_it(command: Command, tm
     path = save_random(tmp_path / "random" / "last.ckpt")
     content = torch.load(path, weights_only=True)
     content["hno"]["game"] = "crossing"
-    torch.save(content, path)
+    path.write_bytes(seal(content))
     run = command("evaluate", f"checkpoint={path}")
     refused(run, "'crossing', which is not registered here", "import that script first", "Known: ", "narrow_road")
 

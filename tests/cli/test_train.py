@@ -124,7 +124,8 @@ def test_last_checkpoint_is_that_of_the_last_step(command: Command, steps: int, 
     run = command("train", *SMOKE, f"trainer.max_steps={steps}", f"trainer.validate_every={every}")
     assert run.code == 0, run.text
     assert torch.load(run.folder / "last.ckpt", weights_only=True)["global_step"] == steps
-    assert sorted(path.name for path in run.folder.glob("*.ckpt")) == ["best.ckpt", "last.ckpt"]
+    kept = ["best.ckpt", "last.ckpt"] + ["previous.ckpt"] * (steps > every)
+    assert sorted(path.name for path in run.folder.glob("*.ckpt")) == kept
 
 
 def test_run_leaves_a_picture_of_an_episode(command: Command, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,6 +12,7 @@ from torch import nn
 
 from hno.operators import ValueOperator
 from hno.training.checkpoint import Provenance, load_operator, record
+from hno.training.saving import seal
 from hno.types import Batch, Field, Labels, Points, Sample
 from tests.operators.conftest import GAMES, MakeModule, MakeOperator, architecture, module_of, random_points
 
@@ -83,7 +84,7 @@ def test_a_checkpoint_keeps_every_member(make_operator: MakeOperator, tmp_path: 
     operator = make_operator("drone", members=3)
     weights = {f"operator.{name}": weight for name, weight in operator.state_dict().items()}
     entries = record(operator.game, architecture(members=3), Provenance())
-    torch.save(entries | {"state_dict": weights}, tmp_path / "last.ckpt")
+    (tmp_path / "last.ckpt").write_bytes(seal(entries | {"state_dict": weights}))
     points = random_points(operator.game)
     loaded: Field = load_operator(tmp_path / "last.ckpt")[0].field(points)
     assert all(map(torch.equal, loaded, operator.field(points)))

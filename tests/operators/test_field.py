@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from hno.operators.inputs import distinct_types, ego_views
 from hno.training.checkpoint import CheckpointError, Provenance, check_resumable, load_operator, record
+from hno.training.saving import seal
 from hno.types import Field, Labels, Points, Sample, Types, tables
 from tests.operators.conftest import ACTIVATIONS, GAMES, MakeOperator, architecture, random_points
 
@@ -100,7 +101,7 @@ def test_an_exact_end_travels_with_the_checkpoint(make_operator: MakeOperator, t
     operator = make_operator("lane_change", exact_terminal=True)
     content = record(operator.game, architecture(exact_terminal=True), Provenance())
     weights = {f"operator.{name}": weight for name, weight in operator.state_dict().items()}
-    torch.save(content | {"state_dict": weights}, tmp_path / "last.ckpt")
+    (tmp_path / "last.ckpt").write_bytes(seal(content | {"state_dict": weights}))
     points = random_points(operator.game)
     with torch.no_grad():
         expected = operator.field(points)

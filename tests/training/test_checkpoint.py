@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import hashlib
 import os
 import pickle
 from collections.abc import Callable
@@ -19,6 +20,7 @@ from hno.operators import Choice, ValueOperator
 from hno.operators import make_operator as built
 from hno.registry import UnknownNameError
 from hno.training.checkpoint import CheckpointError, Provenance, check_resumable, load_operator, read_checkpoint, record
+from hno.training.saving import MARK, seal
 from hno.types import Field, Points, Types
 from tests.operators.conftest import GAMES, MakeOperator, architecture, random_points
 
@@ -26,6 +28,22 @@ Save = Callable[..., Path]
 
 
 ORIGIN = Provenance("hno", [(1.0, 1.0), (1.0, 5.0)], 7, "hash")
+
+
+UNTRAINED = {
+    "global_step": 0,
+    "loops": {
+        "fit_loop": {
+            "epoch_loop.automatic_optimization.optim_progress": {"optimizer": {"step": {"total": {"completed": 0}}}},
+            "epoch_loop.batch_progress": {},
+            "epoch_progress": {},
+        }
+    },
+    "optimizer_states": [{"state": {}, "param_groups": [{"params": [0]}]}],
+    "lr_schedulers": [],
+    "callbacks": {},
+}
+"""As much of what Lightning adds as is looked at before a training goes on."""
 
 
 def saved(operator: ValueOperator, **options: Any) -> dict[str, Any]:
@@ -42,7 +60,7 @@ def save(make_operator: MakeOperator, tmp_path: Path) -> Save:
         whole = saved(make_operator(game))
         whole["hno"] |= spec or {}
         path = tmp_path / "last.ckpt"
-        torch.save(whole | content, path)
+        path.write_bytes(seal(whole | content))
         return path
 
     return write
@@ -80,7 +98,7 @@ def test_branches_that_are_played_travel_with_the_checkpoint(tmp_path: Path) -> 
         if closed is not None:
             original.set_branches(torch.tensor([1 - closed]))
         weights = {f"operator.{name}": weight for name, weight in original.state_dict().items()}
-        torch.save(record(original.game, chosen, ORIGIN) | {"state_dict": weights}, tmp_path / "last.ckpt")
+        (tmp_path / "last.ckpt").write_bytes(seal(record(original.game, chosen, ORIGIN) | {"state_dict": weights}))
         loaded, parts, _ = load_operator(tmp_path / "last.ckpt")
         assert (parts, loaded.potential) == (chosen, True)
         assert torch.equal(loaded.active, original.active)
@@ -92,7 +110,7 @@ def test_branches_that_are_played_travel_with_the_checkpoint(tmp_path: Path) -> 
 
 
 def test_changed_constants_travel_with_the_checkpoint(make_operator: MakeOperator, tmp_path: Path) -> None:
-    torch.save(saved(make_operator(make("narrow_road", radius=1.4))), tmp_path / "last.ckpt")
+    (tmp_path / "last.ckpt").write_bytes(seal(saved(make_operator(make("narrow_road", radius=1.4)))))
     assert load_operator(tmp_path / "last.ckpt")[0].game.radius == 1.4
 
 
@@ -106,19 +124,6 @@ def test_truncated_file(save: Save, kept: float) -> None:
     content = path.read_bytes()
     path.write_bytes(content[: int(kept * len(content)) if kept < 1 else int(kept)])
     assert "not a readable checkpoint" in refused(path)
-
-
-def test_a_flipped_bit_in_the_pickle_is_a_checkpoint_error_or_harmless(save: Save) -> None:
-    path = save()
-    content = path.read_bytes()
-    for place in range(0, 5000, 37):
-        flipped = bytearray(content)
-        flipped[place] ^= 2
-        path.write_bytes(flipped)
-        try:
-            load_operator(path)
-        except (CheckpointError, UnknownNameError):
-            continue
 
 
 @pytest.mark.parametrize("content", [b"", b"not a checkpoint", b"PK\x03\x04 half a zip", bytes(range(256)) * 4])
@@ -136,6 +141,8 @@ def test_a_folder_is_no_checkpoint(tmp_path: Path) -> None:
 def test_checkpoint_of_another_program(tmp_path: Path, content: object) -> None:
     path = tmp_path / "other.ckpt"
     torch.save(content, path)
+    assert "not written by hno, or by a version before format 5" in refused(path)
+    path.write_bytes(seal(content))
     assert "was not written by hno" in refused(path)
 
 
@@ -154,9 +161,10 @@ class Trap:
 def test_code_in_a_checkpoint_is_refused_and_not_run(save: Save, tmp_path: Path, how: str) -> None:
     sprung, path = tmp_path / "sprung", tmp_path / "last.ckpt"
     if how == "pickle":
-        path.write_bytes(pickle.dumps(Trap(sprung)))
+        body = pickle.dumps(Trap(sprung)) + MARK
+        path.write_bytes(body + hashlib.sha256(body).hexdigest().encode())
     elif how == "torch":
-        torch.save(Trap(sprung), path)
+        path.write_bytes(seal(Trap(sprung)))
     else:
         path = save(extra=Trap(sprung))
     for load in (load_operator, read_checkpoint, hno.load_policy):
@@ -200,12 +208,12 @@ def test_weights_of_another_network(save: Save) -> None:
     assert "does not hold the weights" in refused(save(state_dict={}))
 
 
-@pytest.mark.parametrize("version", [1, 2, 3, 99, None])
+@pytest.mark.parametrize("version", [1, 2, 3, 4, 99, None])
 def test_another_format_is_one_clear_sentence(save: Save, version: int | None) -> None:
     """Format 2 is what the releases before wrote: an operator's own name, options and types."""
     older = {"format": version, "game": "narrow_road", "operator": "hno", "options": {"width": 64}, "seen_types": []}
     path = save(hno=older)
-    assert refused(path) == f"{path} has format {version}, this version of hno reads format 4: train it again."
+    assert refused(path) == f"{path} has format {version}, this version of hno reads format 5: train it again."
     assert "train it again" in refused(save(spec={"format": version}))
 
 
@@ -214,12 +222,12 @@ def test_an_incomplete_record_is_refused(make_operator: MakeOperator, tmp_path: 
     whole = saved(make_operator())
     del whole["hno"][entry]
     path = tmp_path / "last.ckpt"
-    torch.save(whole, path)
+    path.write_bytes(seal(whole))
     assert refused(path) == f"{path} is not complete: its entry 'hno' lacks {entry}. Train it again."
 
 
 def test_resuming_asks_for_the_same_game_operator_network_and_origin(make_operator: MakeOperator, save: Save) -> None:
-    path, game = save(), make("narrow_road")
+    path, game = save(**UNTRAINED), make("narrow_road")
     check_resumable(path, record(game, architecture(), ORIGIN))
     for other, differs in (
         (record(make("drone"), architecture(), ORIGIN), "game 'narrow_road', expected 'drone'"),

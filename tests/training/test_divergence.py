@@ -4,48 +4,123 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
+from safetensors.torch import load_file
 from torch import nn
 
-from hno.training.divergence import ERROR, DivergedError, StopOnDivergence
+from hno.training.divergence import BAD_BATCH, ERROR, DivergedError, StopOnDivergence
+from hno.training.saving import CheckpointFiles
+from hno.types import Points, Sample
 
 ADVICE = r"the training diverged\. Lower optimizer\.lr or set trainer\.gradient_clip_val\."
 
 
-def step(callback: StopOnDivergence, number: int, loss: float, max_steps: int = 1000) -> None:
-    trainer = SimpleNamespace(global_step=number, max_steps=max_steps)
-    callback.on_train_batch_end(trainer, nn.Linear(1, 1), {"loss": torch.tensor(loss)}, None, number - 1)
+@pytest.fixture
+def stop(tmp_path: Path) -> StopOnDivergence:
+    """The callback of a run that has saved nothing yet."""
+    return StopOnDivergence(tmp_path, CheckpointFiles())
 
 
-@pytest.mark.parametrize("loss", [math.nan, math.inf, -math.inf])
-def test_a_loss_that_is_not_finite_ends_the_training(loss: float) -> None:
-    with pytest.raises(DivergedError, match=rf"The loss is {loss} at step 50: {ADVICE}"):
-        step(StopOnDivergence(50), 50, loss)
+def trainer(step: int = 49, **entries: Any) -> Any:
+    """As much of a trainer as is asked for, after some steps."""
+    return SimpleNamespace(global_step=step, global_rank=0, precision_plugin=None, **entries)
 
 
-def test_the_loss_is_looked_at_every_so_often_and_at_the_end() -> None:
-    callback = StopOnDivergence(50)
-    for number in (1, 49, 51, 99):
-        step(callback, number, math.nan)
-    for number in (50, 100):
-        with pytest.raises(DivergedError):
-            step(callback, number, math.nan)
-    with pytest.raises(DivergedError, match="step 73"):
-        step(callback, 73, math.nan, max_steps=73)
+def step(callback: StopOnDivergence, net: nn.Module, loss: float = 1.0, grad: float = 1.0, number: int = 50) -> None:
+    """A training step up to where the optimiser would change the weights."""
+    optimizer, at = torch.optim.SGD(net.parameters()), trainer(number - 1)
+    for weights in net.parameters():
+        weights.grad = torch.ones_like(weights)
+    net.weight.grad[0, 0] = grad
+    callback.on_train_batch_start(at, net, {"bvp": Sample(Points(torch.tensor([number]), *EMPTY))}, number)
+    callback.on_before_backward(at, net, torch.tensor(loss))
+    callback.on_before_optimizer_step(at, net, optimizer)
 
 
-def test_a_large_loss_is_no_divergence() -> None:
-    step(StopOnDivergence(1), 1, 1e30)
+EMPTY = torch.zeros(1, 2, 4), torch.zeros(1, 2)
+NOT_FINITE = [math.nan, math.inf, -math.inf]
+
+
+def culprit(folder: Path) -> int:
+    """The step whose batch was kept."""
+    return int(load_file(folder / BAD_BATCH)["bvp.points.tau"])
+
+
+@pytest.mark.parametrize("number", [1, 37, 50])
+@pytest.mark.parametrize("loss", NOT_FINITE)
+def test_a_loss_that_is_not_finite_ends_the_training(
+    stop: StopOnDivergence, tmp_path: Path, loss: float, number: int
+) -> None:
+    with pytest.raises(
+        DivergedError, match=rf"The loss is {loss} at step {number}: {ADVICE} The batch of that step is"
+    ):
+        step(stop, nn.Linear(2, 2), loss, number=number)
+    assert culprit(tmp_path) == number
+
+
+@pytest.mark.parametrize("grad", NOT_FINITE)
+def test_a_gradient_that_is_not_finite_ends_the_training(stop: StopOnDivergence, tmp_path: Path, grad: float) -> None:
+    with pytest.raises(DivergedError, match=f"A gradient is not finite at step 50: {ADVICE}"):
+        step(stop, nn.Linear(2, 2), grad=grad)
+    assert culprit(tmp_path) == 50
+
+
+def test_a_scaler_skips_bad_gradients_itself(stop: StopOnDivergence) -> None:
+    at, net = trainer(), nn.Linear(2, 2)
+    at.precision_plugin = SimpleNamespace(scaler=object())
+    net.weight.grad = torch.full_like(net.weight, math.inf)
+    stop.on_before_backward(at, net, torch.tensor(1.0))
+    stop.on_before_optimizer_step(at, net, torch.optim.SGD(net.parameters()))
+
+
+def test_large_numbers_are_no_divergence(stop: StopOnDivergence) -> None:
+    step(stop, nn.Linear(2, 2), loss=1e38, grad=3e38)
+
+
+def test_weights_that_a_step_spoiled_are_blamed_on_its_batch(stop: StopOnDivergence, tmp_path: Path) -> None:
+    net = nn.Linear(2, 2)
+    step(stop, net, number=7)
+    with torch.no_grad():
+        net.weight[0, 0] = math.inf
+    with pytest.raises(DivergedError, match=f"Step 7 left weights that are not finite: {ADVICE}"):
+        step(stop, net, math.nan, number=8)
+    assert culprit(tmp_path) == 7
+
+
+@pytest.mark.parametrize("value", NOT_FINITE)
+@pytest.mark.parametrize("where", ["operator.weight", "the state of the optimizer"])
+def test_nothing_that_is_not_finite_is_saved(stop: StopOnDivergence, tmp_path: Path, where: str, value: float) -> None:
+    """The boxes of a game may be."""
+    net, stop.files.latest = nn.Linear(2, 2), tmp_path / "last.ckpt"
+    step(stop, net)
+    weights, state = torch.ones(3), torch.ones(3)
+    content: dict[str, Any] = {
+        "state_dict": {"operator.weight": weights, "operator.game.state_box.hi": torch.tensor(math.inf)},
+        "optimizer_states": [{"state": {0: {"exp_avg": [state]}}}],
+    }
+    stop.on_save_checkpoint(trainer(50), net, content)
+    (weights if where == "operator.weight" else state)[1] = value
+    latest = f"The last good checkpoint is {tmp_path / 'last.ckpt'}"
+    with pytest.raises(DivergedError, match=f"Step 50 left {where} with entries that are not finite: .*{latest}"):
+        stop.on_save_checkpoint(trainer(50), net, content)
+    assert culprit(tmp_path) == 50
+
+
+def fresh(**options: float) -> StopOnDivergence:
+    """A callback that has nothing to write."""
+    return StopOnDivergence(Path("unused"), CheckpointFiles(), **options)
 
 
 def validated(errors: Iterable[float], callback: StopOnDivergence | None = None) -> None:
-    callback = callback or StopOnDivergence()
+    callback = callback or fresh()
     for number, error in enumerate(errors):
-        trainer = SimpleNamespace(global_step=100 * (number + 1), callback_metrics={ERROR: torch.tensor(error)})
-        callback.on_validation_end(trainer, nn.Linear(1, 1))
+        metrics = {ERROR: torch.tensor(error)}
+        callback.on_validation_end(trainer(100 * (number + 1), callback_metrics=metrics), nn.Linear(1, 1))
 
 
 @pytest.mark.parametrize("errors", [[3.0], [1.0, 9.9], [5.0, 0.5, 4.9, 0.4, 3.9], [0.1] * 20, [1e6, 1e6], [2.0, 0.0]])
@@ -71,33 +146,33 @@ def test_an_error_beyond_the_factor_is_divergence(errors: list[float], message: 
 
 
 def test_the_factor_can_be_chosen() -> None:
-    validated([1.0, 2.9], StopOnDivergence(growth=3.0))
+    validated([1.0, 2.9], fresh(growth=3.0))
     with pytest.raises(DivergedError):
-        validated([1.0, 3.1], StopOnDivergence(growth=3.0))
+        validated([1.0, 3.1], fresh(growth=3.0))
 
 
 def test_the_smallest_error_survives_a_checkpoint() -> None:
-    first, resumed = StopOnDivergence(), StopOnDivergence()
+    first, resumed = fresh(), fresh()
     validated([0.5, 2.0], first)
     resumed.load_state_dict(first.state_dict())
     with pytest.raises(DivergedError, match=r"5\.5 at step 100; it was 0\.5"):
         validated([5.5], resumed)
-    fresh = StopOnDivergence()
-    fresh.load_state_dict(StopOnDivergence().state_dict())
-    validated([5.5], fresh)
+    new = fresh()
+    new.load_state_dict(fresh().state_dict())
+    validated([5.5], new)
 
 
 def test_a_validation_without_that_error_is_not_judged() -> None:
-    callback = StopOnDivergence()
+    callback = fresh()
     for _ in range(2):
-        callback.on_validation_end(SimpleNamespace(global_step=1, callback_metrics={}), nn.Linear(1, 1))
+        callback.on_validation_end(trainer(1, callback_metrics={}), nn.Linear(1, 1))
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])
 def test_the_last_step_must_leave_finite_weights(value: float) -> None:
     net = nn.Sequential(nn.Linear(2, 2), nn.Linear(2, 2))
-    StopOnDivergence().on_train_end(SimpleNamespace(), net)
+    fresh().on_train_end(trainer(9), net)
     with torch.no_grad():
         net[1].weight[1, 0] = value
-    with pytest.raises(DivergedError, match=f"weights that are not finite: {ADVICE}"):
-        StopOnDivergence().on_train_end(SimpleNamespace(), net)
+    with pytest.raises(DivergedError, match=f"Step 9 left weights that are not finite: {ADVICE}"):
+        fresh().on_train_end(trainer(9), net)
