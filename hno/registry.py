@@ -96,6 +96,12 @@ class Registry(Generic[T]):
             raise UnknownNameError(unknown_name(self.kind, name, self.names()) + failed)
         return self._classes[name]
 
+    def own(self) -> dict[str, type[T]]:
+        """What the running program registered by itself: neither a part of the package nor of an entry point."""
+        ours = self.package.split(".")[0] + "."
+        found = {name: self._classes[name] for name in self.names() if name not in self._origins}
+        return {name: cls for name, cls in found.items() if not cls.__module__.startswith(ours)}
+
     def name_of(self, cls: type[T]) -> str:
         """The name a class is filed under.
 
@@ -133,7 +139,7 @@ class Registry(Generic[T]):
         try:
             load()
         except Exception as error:  # noqa: BLE001  # whatever a plugin raises
-            self.broken[what] = _reason(error)
+            self.broken[what] = reason(error)
             message = f"{what} cannot be loaded, so its {self.kind} is missing: {self.broken[what]}."
             warnings.warn(message, BrokenPluginWarning, stacklevel=4)
 
@@ -152,7 +158,7 @@ def _place(cls: Callable[..., Any]) -> str:
     return f"{cls.__module__}.{cls.__qualname__}"
 
 
-def _reason(error: Exception) -> str:
+def reason(error: Exception) -> str:
     """An error in one line, with the file and the line that it comes from."""
     text = " ".join(f"{type(error).__name__}: {error}".split())
     if isinstance(error, SyntaxError):

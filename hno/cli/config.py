@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 import inspect
 import os
-import re
 import sys
 from collections.abc import Callable, Collection, Mapping, Sequence
 from importlib.metadata import entry_points
@@ -23,10 +22,10 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 import hno
-from hno.cli.arguments import Arguments, UsageError, rewritten
-from hno.cli.schema import GIVEN, REGISTRIES, S, SettingsError, validated
-from hno.cli.settings import TrainSettings
-from hno.registry import options_of, plural, unknown_name
+from hno.cli.arguments import FOLDERS, Arguments, UsageError, rewritten
+from hno.cli.schema import GIVEN, REGISTRIES, S, SettingsError, places, validated
+from hno.cli.settings import COMMANDS, TrainSettings
+from hno.registry import options_of, plural, reason, unknown_name
 
 CHOSEN = ("game", "function", "network", "activation", "optimizer")
 """Groups whose choices are registered; methods of `operator` are files, its functions become methods."""
@@ -110,12 +109,13 @@ def for_hydra(name: str, given: Arguments) -> list[str]:
         raise UsageError(f"--config-dir: there is no folder {folder}.")
     Folders.own = [] if folder is None else [Path(folder)]
     Plugins.instance().register(Folders)
+    composed, paths, many = groups(name), FOLDERS | places(COMMANDS[name]), "--multirun" in given.flags
     swept: Collection[str] = ()
-    if "--multirun" in given.flags:  # Hydra lets the command line narrow an experiment's sweep under the same name only
-        compose(name, [override for override in given.overrides if override.startswith("experiment=")])
+    if many:  # Hydra lets the command line narrow an experiment's sweep under the same name only
+        own = [override for override in given.overrides if override.lstrip("+~").startswith(("experiment=", "hydra"))]
+        compose(name, [rewritten(override, composed, (), paths) for override in own])
         swept = HydraConfig.get().sweeper.params or ()
-    composed = groups(name)
-    return [rewritten(override, composed, swept) for override in given.overrides]
+    return [rewritten(override, composed, swept, paths, many) for override in given.overrides]
 
 
 def compose(name: str, overrides: Sequence[str], *, registered: bool = False) -> DictConfig:
@@ -139,19 +139,38 @@ def compose(name: str, overrides: Sequence[str], *, registered: bool = False) ->
         register_plugins()
         return compose(name, overrides, registered=True)
     HydraConfig.instance().set_config(config)
+    if config.hydra.job.chdir:
+        raise SettingsError(
+            "hydra.job.chdir=true would change what relative paths mean, and every result is written into the run's "
+            "folder without it. Leave it out."
+        )
     OmegaConf.set_struct(config, False)
     del config["hydra"]
     return config
 
 
+REFUSALS = (HydraException, OmegaConfBaseException, OSError, ValueError, LookupError)
+"""What is raised on purpose where a configuration makes no run, besides errors of our own types."""
+
+
 def sentence(error: Exception) -> str:
     """What an error means: of Hydra's, choices that do not exist and overrides that cannot be read."""
     if isinstance(error, MissingConfigException) and error.missing_cfg_file is not None:
-        group, _, choice = error.missing_cfg_file.rpartition("/")
-        return unknown_name("method" if group == "operator" else group, choice, sorted(error.options or ()))
+        return _missing(error.missing_cfg_file, sorted(error.options or ()))
     if isinstance(error, OverrideParseException):
         return f"{error.override} cannot be read: {str(error).splitlines()[0]}."
-    return str(error)
+    meant = isinstance(error, REFUSALS) or type(error).__module__.startswith("hno.")
+    return str(error) if meant else reason(error)
+
+
+def _missing(file: str, known: list[str]) -> str:
+    """That a group has no such choice; a launcher or sweeper that Hydra has no plugin for can be installed."""
+    group, _, choice = file.rpartition("/")
+    said = unknown_name("method" if group == "operator" else group, choice, known)
+    kind = group.removeprefix("hydra/")
+    if kind in ("launcher", "sweeper") and kind != group:
+        return f"{said} Where there is a package for it: pip install hydra-{choice.split('_')[0]}-{kind}"
+    return said
 
 
 def read(model: type[S], config: DictConfig) -> S:
@@ -181,19 +200,16 @@ def configured(name: str, check: Callable[[DictConfig], S], given: Arguments) ->
     """The settings of a command; None after a dry run, which prints them.
 
     Raises:
-        ValueError: a configuration that cannot be composed.
-        Exception: what `check` raises.
+        UsageError: a configuration that makes no run, whatever the reason: parts from outside raise what they will.
     """
-    settings = check(compose(name, for_hydra(name, given)))
+    try:
+        settings = check(compose(name, for_hydra(name, given)))
+    except Exception as error:
+        raise UsageError(sentence(error)) from error
     if "--dry-run" not in given.flags:
         return settings
     print(OmegaConf.to_yaml(OmegaConf.create(settings.model_dump())), end="")
     return None
-
-
-def quoted(value: str) -> str:
-    """A value that Hydra's grammar takes for one text, whatever is in it."""
-    return "'" + re.sub(r"(\\*)'", r"\1\1\\'", value) + "'"
 
 
 def under_hydra(name: str, job: Callable[[DictConfig], Any], words: Sequence[str]) -> None:
