@@ -5,8 +5,9 @@ from __future__ import annotations
 import importlib.util
 import inspect
 import os
+import re
 import sys
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
@@ -50,7 +51,8 @@ class Folders(SearchPathPlugin):
     def all(cls) -> list[Path]:
         """Every folder, ours first."""
         points = [point for kind in REGISTRIES for point in entry_points(group=f"hno.{plural(kind)}")]
-        specs = (importlib.util.find_spec(name) for name in sorted({point.module.split(".")[0] for point in points}))
+        packages = sorted({point.value.partition(":")[0].split(".")[0].strip() for point in points})
+        specs = (importlib.util.find_spec(name) for name in packages if name.isidentifier())
         places = [Path(place) for spec in specs if spec for place in spec.submodule_search_locations or ()]
         offered = [place / "conf" for place in places if (place / "conf").is_dir()]
         return [config_dir(), *offered, *cls.own]
@@ -98,6 +100,48 @@ def _node(group: str, name: str, options: Mapping[str, Any]) -> Any:
     return node
 
 
+HYDRA = {"run": None, "sweep": None, "sweeper": {"params", "max_batch_size"}, "job": {"name", "chdir"}}
+"""What a file of the user's may say of Hydra: the rest can name code, commands and files to write."""
+
+
+def _check_harmless(file: Path) -> None:
+    """Refuse a file of configuration that could run code: Hydra calls whatever `_target_` names.
+
+    Raises:
+        UsageError: with the file and what it says; also where it cannot be read.
+    """
+    try:
+        text = file.read_text(encoding="utf-8")
+        content = OmegaConf.to_container(OmegaConf.create(text), resolve=False)
+    except Exception as error:
+        raise UsageError(f"{file} cannot be read ({type(error).__name__}: {error}).") from error
+    entries: Any = content if isinstance(content, dict) else {}
+    hydra_entries: Any = entries.get("hydra") or {}
+    said = [f"hydra.{key}" for key, value in hydra_entries.items() if not _allowed(key, value)]
+    said += [str(key) for key in _keys(content) if key in ("_target_", "()")]
+    said += [f"hydra.{key}" for key in entries if str(key).startswith("hydra.")]
+    said += [str(entry) for entry in entries.get("defaults") or () if "@" in str(entry) and "hydra" in str(entry)]
+    said += re.findall(r"@package\s+\S*hydra\S*", text) + (["its place"] if "hydra" in file.parts[-3:-1] else [])
+    if said:
+        raise UsageError(
+            f"{file}: {said[0]} could run code or write files elsewhere. A file may choose and set options, and of hydra "
+            f"{', '.join(HYDRA)}; give the rest on the command line."
+        )
+
+
+def _allowed(key: str, value: Any) -> bool:
+    known = HYDRA.get(key, set())
+    return known is None or (isinstance(value, dict) and set(value) <= known and bool(known))
+
+
+def _keys(content: Any) -> Iterator[Any]:
+    """Every key of nested containers."""
+    if isinstance(content, dict):
+        yield from content
+    for entry in content.values() if isinstance(content, dict) else content if isinstance(content, list) else ():
+        yield from _keys(entry)
+
+
 def for_hydra(name: str, given: Arguments) -> list[str]:
     """Overrides as Hydra takes them, after the user's folder and the plugins are known to it.
 
@@ -108,6 +152,8 @@ def for_hydra(name: str, given: Arguments) -> list[str]:
     if folder is not None and not Path(folder).is_dir():
         raise UsageError(f"--config-dir: there is no folder {folder}.")
     Folders.own = [] if folder is None else [Path(folder)]
+    for file in sorted(path for own in Folders.own for path in own.rglob("*.yaml")):
+        _check_harmless(file)
     Plugins.instance().register(Folders)
     composed, paths, many = groups(name), FOLDERS | places(COMMANDS[name]), "--multirun" in given.flags
     swept: Collection[str] = ()
@@ -166,6 +212,8 @@ def sentence(error: Exception) -> str:
 def _missing(file: str, known: list[str]) -> str:
     """That a group has no such choice; a launcher or sweeper that Hydra has no plugin for can be installed."""
     group, _, choice = file.rpartition("/")
+    if group in CHOSEN and any(what.startswith(f"{choice} = ") for what in REGISTRIES[group]().broken):
+        return REGISTRIES[group]().unknown(choice)
     said = unknown_name("method" if group == "operator" else group, choice, known)
     kind = group.removeprefix("hydra/")
     if kind in ("launcher", "sweeper") and kind != group:
@@ -204,6 +252,7 @@ def configured(name: str, check: Callable[[DictConfig], S], given: Arguments) ->
     """
     try:
         settings = check(compose(name, for_hydra(name, given)))
+        str(HydraConfig.get().run.dir)  # it can be resolved
     except Exception as error:
         raise UsageError(sentence(error)) from error
     if "--dry-run" not in given.flags:
