@@ -105,7 +105,7 @@ class Registry(Generic[T]):
         return self._classes[name]
 
     def unknown(self, name: str) -> str:
-        """The message for a name that nothing is registered under: above all that what offers it could not be loaded."""
+        """The message for a name that nothing is registered under, or whose plugin could not be loaded."""
         own = {what: why for what, why in self.broken.items() if what.startswith(f"{name} = ")}
         failed = "".join(f" Could not be loaded: {what}: {why}." for what, why in (own or self.broken).items())
         return (

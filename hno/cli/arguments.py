@@ -50,7 +50,7 @@ def one_screen(message: str) -> str:
         line if len(line) <= 6 * LINE else f"{line[: 4 * LINE]} [...] {line[-LINE:]}" for line in message.splitlines()
     ]
     room, shown = SCREEN, list[str]()
-    while lines and (room := room - 1 - (len(lines[0]) - 1) // LINE) >= 1:
+    while lines and (room := room - max(1, -(-len(lines[0]) // LINE))) >= 1:
         shown.append(lines.pop(0))
     return "\n".join([*shown, *([f"... and {len(lines)} lines more."] if lines else [])])
 

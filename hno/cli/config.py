@@ -124,7 +124,7 @@ def _check_harmless(file: Path) -> None:
     said += re.findall(r"@package\s+\S*hydra\S*", text) + (["its place"] if "hydra" in file.parts[-3:-1] else [])
     if said:
         raise UsageError(
-            f"{file}: {said[0]} could run code or write files elsewhere. A file may choose and set options, and of hydra "
+            f"{file}: {said[0]} could run code or write files elsewhere. A file may choose, set options, and of hydra "
             f"{', '.join(HYDRA)}; give the rest on the command line."
         )
 
