@@ -106,11 +106,9 @@ class Registry(Generic[T]):
 
     def unknown(self, name: str) -> str:
         """The message for a name that nothing is registered under, or whose plugin could not be loaded."""
-        own = {what: why for what, why in self.broken.items() if what.startswith(f"{name} = ")}
-        failed = "".join(f" Could not be loaded: {what}: {why}." for what, why in (own or self.broken).items())
-        return (
-            f"No {self.kind} named {name!r}.{failed}" if own else unknown_name(self.kind, name, self.names()) + failed
-        )
+        own_first = sorted(self.broken.items(), key=lambda entry: not entry[0].startswith(f"{name} = "))
+        failed = "".join(f" Could not be loaded: {what}: {why}." for what, why in own_first)
+        return unknown_name(self.kind, name, self.names()) + failed
 
     def own(self) -> dict[str, type[T]]:
         """What the running program registered by itself: neither a part of the package nor of an entry point."""
