@@ -48,11 +48,13 @@ class Registry(Generic[T]):
     Args:
         kind: what the classes are, in the singular ("game"); it appears in errors.
         package: the package whose modules register classes, e.g. "hno.games".
+        base: where the class lies that registered classes must extend, "module:name", if they must.
     """
 
-    def __init__(self, kind: str, package: str) -> None:
+    def __init__(self, kind: str, package: str, base: str | None = None) -> None:
         self.kind = kind
         self.package = package
+        self.base = base
         self.group = f"hno.{plural(kind)}"
         self.broken: dict[str, str] = {}
         """What could not be loaded, and why: "ModuleNotFoundError: ... (file:line)"."""
@@ -65,9 +67,16 @@ class Registry(Generic[T]):
 
         Raises:
             ValueError: another class already has that name.
+            TypeError: neither a function nor a class of this kind.
         """
 
         def decorate(cls: F) -> F:
+            if not callable(cls):
+                raise TypeError(f"A {self.kind} must be a class or a function that builds one; got {cls!r}.")
+            if self.base is not None and isinstance(cls, type):
+                base = pkgutil.resolve_name(self.base)
+                if not issubclass(cls, base):
+                    raise TypeError(f"A {self.kind} must extend {_place(base)}; {_place(cls)} does not.")
             known = self._classes.get(name)
             if known is not None and _place(known) != _place(cls):
                 raise ValueError(
@@ -92,9 +101,20 @@ class Registry(Generic[T]):
         """
         self._discover()
         if name not in self._classes:
-            failed = "".join(f" Could not be loaded: {what}: {why}." for what, why in self.broken.items())
-            raise UnknownNameError(unknown_name(self.kind, name, self.names()) + failed)
+            raise UnknownNameError(self.unknown(name))
         return self._classes[name]
+
+    def unknown(self, name: str) -> str:
+        """The message for a name that nothing is registered under, or whose plugin could not be loaded."""
+        own_first = sorted(self.broken.items(), key=lambda entry: not entry[0].startswith(f"{name} = "))
+        failed = "".join(f" Could not be loaded: {what}: {why}." for what, why in own_first)
+        return unknown_name(self.kind, name, self.names()) + failed
+
+    def own(self) -> dict[str, type[T]]:
+        """What the running program registered by itself: neither a part of the package nor of an entry point."""
+        ours = self.package.split(".")[0] + "."
+        found = {name: self._classes[name] for name in self.names() if name not in self._origins}
+        return {name: cls for name, cls in found.items() if not cls.__module__.startswith(ours)}
 
     def name_of(self, cls: type[T]) -> str:
         """The name a class is filed under.
@@ -132,9 +152,9 @@ class Registry(Generic[T]):
         """Load a part; one that fails is named and does not stop the others."""
         try:
             load()
-        except Exception as error:  # noqa: BLE001  # whatever a plugin raises
-            self.broken[what] = _reason(error)
-            message = f"{what} cannot be loaded, so its {self.kind} is missing: {self.broken[what]}."
+        except (Exception, SystemExit) as error:  # noqa: BLE001  # whatever a plugin raises
+            self.broken[what] = reason(error)
+            message = f"{what} cannot be loaded, so its {self.kind} is missing: {self.broken[what]}. Mend or remove it."
             warnings.warn(message, BrokenPluginWarning, stacklevel=4)
 
 
@@ -145,20 +165,21 @@ def plural(kind: str) -> str:
 
 def origin_of(point: EntryPoint) -> str:
     """Name and version of the distribution that offers an entry point."""
-    return f"{point.dist.name} {point.dist.version}" if point.dist is not None else point.module
+    return f"{point.dist.name} {point.dist.version}" if point.dist is not None else point.value.partition(":")[0]
 
 
 def _place(cls: Callable[..., Any]) -> str:
     return f"{cls.__module__}.{cls.__qualname__}"
 
 
-def _reason(error: Exception) -> str:
-    """An error in one line, with the file and the line that it comes from."""
-    text = " ".join(f"{type(error).__name__}: {error}".split())
+def reason(error: BaseException) -> str:
+    """An error in one line, with the file and the line that it comes from, where that is not the import itself."""
+    text = " ".join(f"{type(error).__name__}: {error}".split()).rstrip(".")
     if isinstance(error, SyntaxError):
         return text if error.filename is None else f"{text} ({error.filename})"
-    frames = [f for f in traceback.extract_tb(error.__traceback__) if not f.filename.startswith("<frozen")]
-    return f"{text} ({frames[-1].filename}:{frames[-1].lineno})"
+    places = [f"{frame.filename}:{frame.lineno}" for frame in traceback.extract_tb(error.__traceback__)]
+    places = [place for place in places if "importlib" not in place and not place.startswith(__file__)]
+    return f"{text} ({places[-1]})" if places else text
 
 
 def unknown_name(kind: str, name: str, known: list[str]) -> str:

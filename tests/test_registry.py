@@ -222,7 +222,7 @@ version = "0.3"
 py-modules = ["menagerie"]
 """
 MENAGERIE = """
-class {name}:
+def {name}():
     "One of another package."
 """
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import NamedTuple
 
 from hno.registry import unknown_name
@@ -26,9 +26,33 @@ TYPES = re.compile(r"""(\+*(?:theta|unseen|(?:\w+\.)*types)=)([-+.\d][^'"\[\]{}$
 SHARE = re.compile(r"\+*(sampler\.\w+)=([\d.,e-]+)")
 """The share of a source by itself: its options stay as they are."""
 
+FOLDERS = dict.fromkeys(("hydra.run.dir", "hydra.sweep.dir", "hydra.sweep.subdir"), False)
+"""Keys of Hydra that hold paths, one each."""
+PLAIN = re.compile(r"(?!(?:true|false|nan|inf)$)[A-Za-z/][\w/.-]*", re.IGNORECASE)
+"""A path that Hydra's grammar reads as it stands."""
+QUOTED = r"""'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*\""""
+ENTRY = re.compile(rf"\s*(?:{QUOTED}|\[[^\]]*\])\s*(?=,|$)|[^,]+")
+"""What stands between commas that are in no quotes or brackets."""
+SWEEP = re.compile(r"(?:choice|glob|range|interval|shuffle|sort|tag)\(.*\)")
+
+
+LINE, SCREEN = 78, 22
+"""Characters of a terminal's line, and its lines, that a message may fill."""
+
 
 class UsageError(ValueError):
-    """Words that make no command; the message says what was expected."""
+    """What is refused before any work: words or a configuration that make none; the message says what was expected."""
+
+
+def one_screen(message: str) -> str:
+    """A message of at most one screen: long lines without their middle, and only as many as there is room for."""
+    lines = [
+        line if len(line) <= 6 * LINE else f"{line[: 4 * LINE]} [...] {line[-LINE:]}" for line in message.splitlines()
+    ]
+    room, shown = SCREEN, list[str]()
+    while lines and (room := room - max(1, -(-len(lines[0]) // LINE))) >= 1:
+        shown.append(lines.pop(0))
+    return "\n".join([*shown, *([f"... and {len(lines)} lines more."] if lines else [])])
 
 
 class Arguments(NamedTuple):
@@ -66,19 +90,55 @@ def parse(given: Sequence[str]) -> Arguments:
     return found
 
 
-def rewritten(override: str, groups: Collection[str], untouched: Collection[str]) -> str:
+def quoted(value: str) -> str:
+    """A value that Hydra's grammar takes for one text, whatever is in it."""
+    return "'" + re.sub(r"(\\*)('|$)", lambda found: 2 * found[1] + found[2].replace("'", "\\'"), value) + "'"
+
+
+def as_path(value: str, lists: bool = False, many: bool = False) -> str:
+    """A path as Hydra's grammar takes it, whatever is in its name; of a list, and of the choices of a multirun, each.
+
+    Args:
+        value: as given; what is in quotes stays as it is.
+        lists: whether it may be a list, [a,b].
+        many: whether commas separate choices.
+    """
+    if value in ("", "null") or PLAIN.fullmatch(value) or re.fullmatch(QUOTED, value):
+        return value
+    if many and SWEEP.fullmatch(value):
+        return value
+    entries = ENTRY.findall(value)
+    if many and len(entries) > 1:
+        return ",".join(as_path(entry.strip(), lists) for entry in entries)
+    if lists and re.fullmatch(r"\[.*\]", value):
+        return "[" + ",".join(as_path(entry.strip()) for entry in ENTRY.findall(value[1:-1])) + "]"
+    return quoted(value)
+
+
+def rewritten(
+    override: str,
+    groups: Collection[str],
+    untouched: Collection[str],
+    paths: Mapping[str, bool] = FOLDERS,
+    many: bool = False,
+) -> str:
     """An override as Hydra is to see it: any key may be set, since the schema judges the result.
 
-    A list of player types is quoted, `sampler.<source>=0.2` means the source's share; `a.b=c` and `+a.b=c` become
-    `++a.b=c`, `+group=choice` becomes `group=choice`.
+    Paths and a list of player types are quoted, `sampler.<source>=0.2` means the source's share; `a.b=c` and `+a.b=c`
+    become `++a.b=c`, `+group=choice` becomes `group=choice`.
 
     Args:
         override: as given.
         groups: those that the command composes.
         untouched: further keys, which stay as given.
+        paths: keys that hold paths, and whether they may hold several.
+        many: whether commas separate the choices of a multirun.
     """
     key, equals, value = override.partition("=")
     bare = key.lstrip("+").split("@")[0]
+    if equals and bare in paths:
+        value = as_path(value, paths[bare], many)
+        override = f"{key}={value}"
     if key.startswith("~") or bare.startswith(("hydra.", "hydra/")):
         return override
     if bare in groups:

@@ -10,6 +10,7 @@ from omegaconf import DictConfig
 
 from hno.cli.config import read
 from hno.cli.evaluate import check_evaluation, unseen_types
+from hno.cli.logs import check_wandb
 from hno.cli.settings import TrainSettings
 from hno.data import Collocation, GameData, LabelPlan, make_sampler
 from hno.data.curriculum import Curriculum
@@ -42,6 +43,8 @@ def check(config: DictConfig) -> TrainSettings:
         ValueError, LookupError: entries that are unknown or make no sense, together or for the game.
     """
     settings = read(TrainSettings, config)
+    if "wandb" in settings.logger.names:
+        check_wandb()
     with warnings.catch_warnings(action="ignore"):  # the run warns
         built = build(settings)
         game = built.data.game

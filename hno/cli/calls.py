@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from hno.cli import evaluate as evaluation
-from hno.cli.arguments import Arguments
+from hno.cli.arguments import Arguments, quoted
 from hno.cli.build import check
-from hno.cli.config import compose, for_hydra, groups, quoted
+from hno.cli.config import compose, for_hydra, groups
 from hno.cli.logs import quiet_lightning
 from hno.cli.results import Results, recorded
 from hno.cli.settings import TrainSettings

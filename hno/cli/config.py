@@ -7,7 +7,7 @@ import inspect
 import os
 import re
 import sys
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
@@ -23,10 +23,10 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 import hno
-from hno.cli.arguments import Arguments, UsageError, rewritten
-from hno.cli.schema import GIVEN, REGISTRIES, S, SettingsError, validated
-from hno.cli.settings import TrainSettings
-from hno.registry import options_of, plural, unknown_name
+from hno.cli.arguments import FOLDERS, Arguments, UsageError, rewritten
+from hno.cli.schema import GIVEN, REGISTRIES, S, SettingsError, places, validated
+from hno.cli.settings import COMMANDS, TrainSettings
+from hno.registry import options_of, plural, reason, unknown_name
 
 CHOSEN = ("game", "function", "network", "activation", "optimizer")
 """Groups whose choices are registered; methods of `operator` are files, its functions become methods."""
@@ -51,7 +51,8 @@ class Folders(SearchPathPlugin):
     def all(cls) -> list[Path]:
         """Every folder, ours first."""
         points = [point for kind in REGISTRIES for point in entry_points(group=f"hno.{plural(kind)}")]
-        specs = (importlib.util.find_spec(name) for name in sorted({point.module.split(".")[0] for point in points}))
+        packages = sorted({point.value.partition(":")[0].split(".")[0].strip() for point in points})
+        specs = (importlib.util.find_spec(name) for name in packages if name.isidentifier())
         places = [Path(place) for spec in specs if spec for place in spec.submodule_search_locations or ()]
         offered = [place / "conf" for place in places if (place / "conf").is_dir()]
         return [config_dir(), *offered, *cls.own]
@@ -99,6 +100,48 @@ def _node(group: str, name: str, options: Mapping[str, Any]) -> Any:
     return node
 
 
+HYDRA = {"run": None, "sweep": None, "sweeper": {"params", "max_batch_size"}, "job": {"name", "chdir"}}
+"""What a file of the user's may say of Hydra: the rest can name code, commands and files to write."""
+
+
+def _check_harmless(file: Path) -> None:
+    """Refuse a file of configuration that could run code: Hydra calls whatever `_target_` names.
+
+    Raises:
+        UsageError: with the file and what it says; also where it cannot be read.
+    """
+    try:
+        text = file.read_text(encoding="utf-8")
+        content = OmegaConf.to_container(OmegaConf.create(text), resolve=False)
+    except Exception as error:
+        raise UsageError(f"{file} cannot be read ({type(error).__name__}: {error}).") from error
+    entries: Any = content if isinstance(content, dict) else {}
+    hydra_entries: Any = entries.get("hydra") or {}
+    said = [f"hydra.{key}" for key, value in hydra_entries.items() if not _allowed(key, value)]
+    said += [str(key) for key in _keys(content) if key in ("_target_", "()")]
+    said += [f"hydra.{key}" for key in entries if str(key).startswith("hydra.")]
+    said += [str(entry) for entry in entries.get("defaults") or () if "@" in str(entry) and "hydra" in str(entry)]
+    said += re.findall(r"@package\s+\S*hydra\S*", text) + (["its place"] if "hydra" in file.parts[-3:-1] else [])
+    if said:
+        raise UsageError(
+            f"{file}: {said[0]} could run code or write files elsewhere. A file may choose, set options, and of hydra "
+            f"{', '.join(HYDRA)}; give the rest on the command line."
+        )
+
+
+def _allowed(key: str, value: Any) -> bool:
+    known = HYDRA.get(key, set())
+    return known is None or (isinstance(value, dict) and set(value) <= known and bool(known))
+
+
+def _keys(content: Any) -> Iterator[Any]:
+    """Every key of nested containers."""
+    if isinstance(content, dict):
+        yield from content
+    for entry in content.values() if isinstance(content, dict) else content if isinstance(content, list) else ():
+        yield from _keys(entry)
+
+
 def for_hydra(name: str, given: Arguments) -> list[str]:
     """Overrides as Hydra takes them, after the user's folder and the plugins are known to it.
 
@@ -109,13 +152,16 @@ def for_hydra(name: str, given: Arguments) -> list[str]:
     if folder is not None and not Path(folder).is_dir():
         raise UsageError(f"--config-dir: there is no folder {folder}.")
     Folders.own = [] if folder is None else [Path(folder)]
+    for file in sorted(path for own in Folders.own for path in own.rglob("*.yaml")):
+        _check_harmless(file)
     Plugins.instance().register(Folders)
+    composed, paths, many = groups(name), FOLDERS | places(COMMANDS[name]), "--multirun" in given.flags
     swept: Collection[str] = ()
-    if "--multirun" in given.flags:  # Hydra lets the command line narrow an experiment's sweep under the same name only
-        compose(name, [override for override in given.overrides if override.startswith("experiment=")])
+    if many:  # Hydra lets the command line narrow an experiment's sweep under the same name only
+        own = [override for override in given.overrides if override.lstrip("+~").startswith(("experiment=", "hydra"))]
+        compose(name, [rewritten(override, composed, (), paths) for override in own])
         swept = HydraConfig.get().sweeper.params or ()
-    composed = groups(name)
-    return [rewritten(override, composed, swept) for override in given.overrides]
+    return [rewritten(override, composed, swept, paths, many) for override in given.overrides]
 
 
 def compose(name: str, overrides: Sequence[str], *, registered: bool = False) -> DictConfig:
@@ -139,19 +185,40 @@ def compose(name: str, overrides: Sequence[str], *, registered: bool = False) ->
         register_plugins()
         return compose(name, overrides, registered=True)
     HydraConfig.instance().set_config(config)
+    if config.hydra.job.chdir:
+        raise SettingsError(
+            "hydra.job.chdir=true would change what relative paths mean, and every result is written into the run's "
+            "folder without it. Leave it out."
+        )
     OmegaConf.set_struct(config, False)
     del config["hydra"]
     return config
 
 
+REFUSALS = (HydraException, OmegaConfBaseException, OSError, ValueError, LookupError)
+"""What is raised on purpose where a configuration makes no run, besides errors of our own types."""
+
+
 def sentence(error: Exception) -> str:
     """What an error means: of Hydra's, choices that do not exist and overrides that cannot be read."""
     if isinstance(error, MissingConfigException) and error.missing_cfg_file is not None:
-        group, _, choice = error.missing_cfg_file.rpartition("/")
-        return unknown_name("method" if group == "operator" else group, choice, sorted(error.options or ()))
+        return _missing(error.missing_cfg_file, sorted(error.options or ()))
     if isinstance(error, OverrideParseException):
         return f"{error.override} cannot be read: {str(error).splitlines()[0]}."
-    return str(error)
+    meant = isinstance(error, REFUSALS) or type(error).__module__.startswith("hno.")
+    return str(error) if meant else reason(error)
+
+
+def _missing(file: str, known: list[str]) -> str:
+    """That a group has no such choice; a launcher or sweeper that Hydra has no plugin for can be installed."""
+    group, _, choice = file.rpartition("/")
+    if group in CHOSEN and any(what.startswith(f"{choice} = ") for what in REGISTRIES[group]().broken):
+        return REGISTRIES[group]().unknown(choice)
+    said = unknown_name("method" if group == "operator" else group, choice, known)
+    kind = group.removeprefix("hydra/")
+    if kind in ("launcher", "sweeper") and kind != group:
+        return f"{said} Where there is a package for it: pip install hydra-{choice.split('_')[0]}-{kind}"
+    return said
 
 
 def read(model: type[S], config: DictConfig) -> S:
@@ -181,19 +248,17 @@ def configured(name: str, check: Callable[[DictConfig], S], given: Arguments) ->
     """The settings of a command; None after a dry run, which prints them.
 
     Raises:
-        ValueError: a configuration that cannot be composed.
-        Exception: what `check` raises.
+        UsageError: a configuration that makes no run, whatever the reason: parts from outside raise what they will.
     """
-    settings = check(compose(name, for_hydra(name, given)))
+    try:
+        settings = check(compose(name, for_hydra(name, given)))
+        str(HydraConfig.get().run.dir)  # it can be resolved
+    except Exception as error:
+        raise UsageError(sentence(error)) from error
     if "--dry-run" not in given.flags:
         return settings
     print(OmegaConf.to_yaml(OmegaConf.create(settings.model_dump())), end="")
     return None
-
-
-def quoted(value: str) -> str:
-    """A value that Hydra's grammar takes for one text, whatever is in it."""
-    return "'" + re.sub(r"(\\*)'", r"\1\1\\'", value) + "'"
 
 
 def under_hydra(name: str, job: Callable[[DictConfig], Any], words: Sequence[str]) -> None:

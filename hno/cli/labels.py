@@ -9,6 +9,7 @@ from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
 
+from omegaconf import DictConfig
 from rich.console import Console
 from rich.table import Table
 
@@ -31,7 +32,7 @@ COLUMNS = (
 def run(given: Arguments) -> int:
     """`hno labels`; the exit code is 0 only if every set is complete."""
     use_threads(1)
-    settings = configured("labels", functools.partial(read, LabelSettings), given)
+    settings = configured("labels", check, given)
     try:
         if settings is not None:
             generate(settings)
@@ -43,6 +44,17 @@ def run(given: Arguments) -> int:
         print("Stopped. Finished shards are kept: the same command goes on from here.", file=sys.stderr)
         return 130
     return 0
+
+
+def check(config: DictConfig) -> LabelSettings:
+    """The settings of labels that can be solved.
+
+    Raises:
+        ValueError, LookupError: entries that are unknown or make no sense, together or for the game.
+    """
+    settings = read(LabelSettings, config)
+    parse_types(make(settings.game.name, **settings.game.constants), settings.theta, key="theta")
+    return settings
 
 
 def generate(settings: LabelSettings) -> None:

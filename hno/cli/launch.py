@@ -6,32 +6,33 @@ import logging
 import sys
 import tempfile
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig
 
 import hno
 from hno.cli import pages
-from hno.cli.arguments import Arguments
-from hno.cli.config import configured, for_hydra, quoted, register_plugins, sentence, under_hydra
+from hno.cli.arguments import Arguments, UsageError, one_screen, quoted
+from hno.cli.config import REFUSALS, configured, for_hydra, register_plugins, sentence, under_hydra
 from hno.cli.logs import finish_wandb, send_lightning_to_hydra
 from hno.cli.results import Results, recorded
+from hno.cli.schema import REGISTRIES
 from hno.cli.sections import show
-from hno.cli.sweep import Job, show_jobs
+from hno.cli.sweep import Entry, Job, Ledger, show_jobs
 from hno.evaluation.format import NAMES, counted
 from hno.registry import UnknownNameError
-from hno.training.checkpoint import CheckpointError
 
 log = logging.getLogger(__name__)
 
-REFUSALS = (HydraException, CheckpointError, ValueError, LookupError)
-"""What a configuration raises that makes no run."""
 QUIET = ("hydra/hydra_logging=disabled", "hydra/job_logging=disabled", "hydra.output_subdir=null")
+
+
+Parts = Mapping[str, Mapping[str, Any]]
+"""Classes and functions by kind and name."""
 
 
 class Task(NamedTuple):
@@ -55,60 +56,110 @@ def run(task: Task, given: Arguments) -> int:
 
     Returns:
         The exit code: 1 if a job failed.
+
+    Raises:
+        UsageError: nothing was done, since the configuration makes no run.
     """
-    many = "--multirun" in given.flags
-    try:
-        if not many and configured(task.name, task.check, given) is None:
-            return 0  # a dry run
-        return _jobs(task, given, many, dry=many and "--dry-run" in given.flags)
-    except REFUSALS as error:
-        message = sentence(error)
-    except OSError as error:
-        message = f"The output folder cannot be written ({error}). Choose another with --to <folder>."
-    print(message, file=sys.stderr)
-    return 1
-
-
-def _jobs(task: Task, given: Arguments, many: bool, dry: bool) -> int:
-    """Let Hydra run every job. A sweep ends with a table, also when it is interrupted; a dry one prints its jobs."""
-    jobs: list[Job] = []
-    outcomes: list[bool] = []
+    if "--multirun" in given.flags:
+        return _multirun(task, given)
+    if configured(task.name, task.check, given) is None:
+        return 0  # a dry run
+    folders: list[Path] = []
+    succeeded: list[bool] = []
 
     def job(config: DictConfig) -> None:
-        current = Job.current()
-        jobs.append(current)
-        if dry:
-            print(f"{current.number}: {' '.join(current.settings)}")
-        try:
-            settings = task.check(config)
-        except Exception as error:
-            print(f"   refused: {error}") if dry else _refuse(current, error)
-            outcomes.append(False)
-        else:
-            outcomes.append(dry or perform(task, settings, current.folder))
+        folders.append(Path(HydraConfig.get().runtime.output_dir))
+        succeeded.append(perform(task, task.check(config), folders[0]))
 
-    words = [*(["--multirun"] if many else []), *for_hydra(task.name, given)]
     register_plugins()
-    with tempfile.TemporaryDirectory() as nowhere:
+    try:
+        under_hydra(task.name, job, for_hydra(task.name, given))
+    except Exception as error:
+        if folders:
+            raise
+        raise _refusal(error) from error
+    print(pages.write(folders[0]))
+    return 0 if all(succeeded) else 1
+
+
+def _refusal(error: Exception) -> UsageError:
+    """What Hydra raises before a job begins."""
+    if isinstance(error, OSError):
+        return UsageError(f"The output folder cannot be written ({error}). Choose another with --to <folder>.")
+    return UsageError(sentence(error))
+
+
+def _multirun(task: Task, given: Arguments) -> int:
+    """Let Hydra's launcher run every job. It ends with a table, also when it is interrupted; a dry one prints its jobs.
+
+    Launchers run jobs in processes of their own: what became of each is in a file of the ledger.
+    """
+    dry = "--dry-run" in given.flags
+    try:
+        words = for_hydra(task.name, given)
+        register_plugins()
+        with tempfile.TemporaryDirectory() as nowhere:
+            folder = Path(nowhere if dry else HydraConfig.get().sweep.dir).absolute()
+            words = [*_here(words), *QUIET] if dry else words
+            return _swept(task, ["--multirun", *words, f"hydra.sweep.dir={quoted(str(folder))}"], folder, dry)
+    except REFUSALS as error:
+        raise _refusal(error) from error
+
+
+def _here(words: Sequence[str]) -> list[str]:
+    """Overrides without the launcher: a dry run stays in this process."""
+    return [word for word in words if not word.lstrip("+").startswith(("hydra/launcher", "hydra.launcher"))]
+
+
+def _swept(task: Task, words: Sequence[str], folder: Path, dry: bool) -> int:
+    own = {kind: registry().own() for kind, registry in REGISTRIES.items()}
+    failure = None
+    with Ledger.within(folder) as ledger:
+
+        def job(config: DictConfig) -> None:  # a launcher may send it to another process
+            _job(task, config, ledger, own, dry)
+
         try:
-            under_hydra(task.name, job, [*words, *QUIET, f"hydra.sweep.dir={quoted(nowhere)}"] if dry else words)
+            under_hydra(task.name, job, words)
+        except Exception as error:
+            if isinstance(error, REFUSALS) and not ledger.entries():
+                raise
+            failure = error
         finally:
-            if many and jobs and not dry:
-                show_jobs(jobs)
+            found = ledger.entries()
+            if found and not dry:
+                show_jobs([entry.job for entry in found])
+    refused = sum(not entry.succeeded for entry in found)
     if dry:
-        refused = outcomes.count(False)
-        print(counted(len(jobs), "job") + (f", {refused} refused" if refused else ""))
-    if not many:
-        print(pages.write(jobs[0].folder))
-    return 0 if all(outcomes) else 1
+        print(counted(len(found), "job") + (f", {refused} refused" if refused else ""))
+    if failure is not None:
+        print(f"The launcher ended before all jobs did: {one_screen(sentence(failure))}", file=sys.stderr)
+    return 1 if refused or failure is not None else 0
+
+
+def _job(task: Task, config: DictConfig, ledger: Ledger, own: Parts, dry: bool) -> None:
+    """One job of a multirun, perhaps in another process, which is told what the user's own program registered."""
+    for kind, parts in own.items():
+        for name, part in parts.items():
+            REGISTRIES[kind]().register(name)(part)
+    current = Job.current()
+    ledger.write(Entry(current))
+    if dry:
+        print(f"{current.number}: {' '.join(current.settings)}")
+    try:
+        settings = task.check(config)
+    except Exception as error:
+        print(f"   refused: {one_screen(sentence(error))}") if dry else _refuse(current, error)
+    else:
+        ledger.write(Entry(current, dry or perform(task, settings, current.folder)))
 
 
 def _refuse(job: Job, error: Exception) -> None:
     """Leave the reason in the results of a job that is not run: it is no failure of the jobs after it."""
     chosen = HydraConfig.get().runtime.choices
     results = Results(job.folder / "results.json", {group: chosen.get(group) for group in NAMES})
-    results.update(status="failed", reason=str(error))
-    log.error("%s", error, exc_info=None if isinstance(error, REFUSALS) else error)
+    results.update(status="failed", reason=sentence(error))
+    log.error("%s", one_screen(sentence(error)))
 
 
 def perform(task: Task, settings: Any, folder: Path) -> bool:

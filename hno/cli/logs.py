@@ -30,6 +30,8 @@ EXPECTED = (
     ".*does not have many workers",  # batches are made in memory
 )
 """Warnings of Lightning that mean nothing here."""
+MODES = ("online", "offline", "disabled", "shared", "dryrun", "run")
+"""What W&B takes for WANDB_MODE."""
 
 
 def send_lightning_to_hydra() -> None:
@@ -100,6 +102,19 @@ def finish_wandb(results: Mapping[str, Any]) -> None:
     if wandb.run is not None:
         wandb.run.summary.update({name: results[name] for name in ("status", "reason")})
     wandb.finish(exit_code=int(results["status"] != "finished"))
+
+
+def check_wandb() -> None:
+    """Take an empty WANDB_MODE for none, which W&B does not.
+
+    Raises:
+        ValueError: W&B has no such mode.
+    """
+    mode = os.environ.get("WANDB_MODE")
+    if not mode:
+        os.environ.pop("WANDB_MODE", None)
+    elif mode not in MODES:
+        raise ValueError(f"WANDB_MODE must be {', '.join(MODES)} or unset; got {mode!r}. Or choose logger=csv.")
 
 
 def wandb_mode(choice: str) -> str:

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import hno
-from hno.cli.arguments import FLAGS, Arguments, UsageError, parse
+from hno.cli.arguments import FLAGS, Arguments, UsageError, one_screen, parse, quoted
 from hno.registry import UnknownNameError, unknown_name
 
 
@@ -80,7 +80,7 @@ def main(given: Sequence[str] | None = None, prog: str | None = None) -> int:
         prog: how the command was called, for its help.
 
     Returns:
-        The exit code.
+        The exit code: 2 if the command was refused before any work, 1 if work failed.
     """
     name, *rest = [*(sys.argv[1:] if given is None else given)] or ["--help"]
     try:
@@ -94,7 +94,7 @@ def main(given: Sequence[str] | None = None, prog: str | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except (UnknownNameError, OSError, ValueError) as error:
-        print(error, file=sys.stderr)
+        print(one_screen(str(error)), file=sys.stderr)
         return 2 if isinstance(error, UsageError) else 1
     except KeyboardInterrupt:
         print("Interrupted.", file=sys.stderr)
@@ -123,13 +123,15 @@ def _configured(command: Command, given: Arguments, prog: str) -> Arguments:
     """A bare word and --to as the overrides that they stand for, where the command has a configuration."""
     if command.config is None:
         return given
-    from hno.cli.config import quoted
-
-    if len(given.words) > (command.word is not None):
-        raise UsageError(f"{prog}: what is {given.words[-1]!r}? Usage: {prog} {command.usage}")
-    stands_for = [f"{command.word}={quoted(word)}" for word in given.words]
+    words, overrides = given.words, given.overrides
+    if command.word is not None:  # a path that is there is no key=value, whatever its name
+        words = [*words, *(entry for entry in overrides if os.path.exists(entry))]  # noqa: PTH110  # no error for any name
+        overrides = [entry for entry in overrides if entry not in words]
+    if len(words) > (command.word is not None):
+        raise UsageError(f"{prog}: what is {words[-1]!r}? Usage: {prog} {command.usage}")
+    stands_for = [f"{command.word}={quoted(word)}" for word in words]
     stands_for += [f"{key}={quoted(given.flags['--to'])}" for key in command.to if "--to" in given.flags]
-    return given._replace(words=[], overrides=[*given.overrides, *stands_for])
+    return given._replace(words=[], overrides=[*overrides, *stands_for])
 
 
 def _overview() -> str:

@@ -7,7 +7,7 @@ import shlex
 import time
 from pathlib import Path
 
-from hno.cli.arguments import Arguments
+from hno.cli.arguments import Arguments, UsageError
 from hno.cli.config import configured, read
 from hno.cli.settings import ReportSettings
 
@@ -40,9 +40,13 @@ def _needs(error: ModuleNotFoundError) -> str:
 def run(given: Arguments) -> int:
     """`hno report`."""
     settings = configured("report", functools.partial(read, ReportSettings), given)
+    from hno.report.runs import NoRunsError
+
     try:
         if settings is not None:
             _report(settings, Path(settings.folder))
+    except NoRunsError as error:
+        raise UsageError(str(error)) from error
     except ModuleNotFoundError as error:
         raise OSError(f"A report {_needs(error)}") from error
     return 0

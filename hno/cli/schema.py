@@ -7,7 +7,7 @@ import pkgutil
 import re
 from collections.abc import Callable, Collection, Mapping
 from functools import partial
-from typing import Annotated, Any, TypeVar, get_args
+from typing import Annotated, Any, TypeVar, get_args, get_origin
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, create_model
 from pydantic_core import PydanticCustomError
@@ -61,6 +61,17 @@ def _sentence(model: type[Settings], found: Any) -> str:
     return f"{key}: {cause}" if cause else f"{key} {expected}; got {found['input']!r}."
 
 
+def places(model: type[BaseModel], above: str = "") -> dict[str, bool]:
+    """Keys of a schema that hold a `Place`, and whether they may hold several."""
+    found: dict[str, bool] = {}
+    for name, field in model.model_fields.items():
+        if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
+            found |= places(field.annotation, f"{above}{name}.")
+        elif "path" in field.metadata or Place in get_args(field.annotation):
+            found[above + name] = get_origin(field.annotation) is list
+    return found
+
+
 def _loose(value: Any) -> Any:
     if isinstance(value, bool) or not isinstance(value, (int, float, str, list)):
         raise PydanticCustomError("loose", "Input should be a number, text or a list")
@@ -74,6 +85,8 @@ Positive = Annotated[float, Field(gt=0)]
 Amount = Annotated[float, Field(ge=0)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Text = Annotated[str, Field(min_length=1)]
+Place = Annotated[str, Field(min_length=1), "path"]
+"""A path."""
 Loose = Annotated[Any, AfterValidator(_loose)]
 """What Lightning judges, or `hno.games.grid.parse_types`."""
 REGISTRIES: Mapping[str, Callable[[], Registry[Any]]] = {

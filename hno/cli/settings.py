@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field
 
 from hno.cli import schema
-from hno.cli.schema import Amount, Count, Loose, Positive, Seed, Settings, Share, Size, Text
+from hno.cli.schema import Amount, Count, Loose, Place, Positive, Seed, Settings, Share, Size, Text
 
 
 class GameSettings(Settings):
@@ -62,8 +62,8 @@ class DataSettings(Settings):
     widening: Share
     finish: Share
     interior_types: Literal["labelled", "box"]
-    cache: Text | None
-    files: list[Text]
+    cache: Place | None
+    files: list[Place]
     workers: Size | None
 
 
@@ -148,14 +148,14 @@ class TrainSettings(Settings):
     evaluation: EvaluationSettings
     validation: ValidationSettings
     seed: Seed
-    resume: Text | None
+    resume: Place | None
 
 
 class EvaluateSettings(Episodes):
     """`hno evaluate`."""
 
     checkpoint: Annotated[
-        list[Text], Field(min_length=1), BeforeValidator(lambda given: [given] if isinstance(given, str) else given)
+        list[Place], Field(min_length=1), BeforeValidator(lambda given: [given] if isinstance(given, str) else given)
     ]
     expected_game: Text | None
     theta: Loose | None
@@ -165,7 +165,7 @@ class EvaluateSettings(Episodes):
     conditions: dict[str, Any]
     online: Count
     online_interval: Size
-    cache: Text | None
+    cache: Place | None
     workers: Size | None
     threads: Size | None
 
@@ -181,13 +181,22 @@ class LabelSettings(Settings):
     all_equilibria: bool | None
     widen: Positive
     workers: Size | None
-    cache: Text | None
+    cache: Place | None
 
 
 class ReportSettings(Settings):
     """`hno report`."""
 
-    folder: Text
-    to: Text | None
+    folder: Place
+    to: Place | None
     figures: bool
     watch: Annotated[float, Field(ge=1)] | None
+
+
+COMMANDS: dict[str, type[Settings]] = {
+    "train": TrainSettings,
+    "evaluate": EvaluateSettings,
+    "labels": LabelSettings,
+    "report": ReportSettings,
+}
+"""By the name of the root configuration."""

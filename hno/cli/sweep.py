@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Collection, Mapping, Sequence
+import tempfile
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,6 +17,7 @@ from rich.console import Console
 from rich.table import Table
 
 from hno.cli import pages
+from hno.cli.results import write_json
 from hno.evaluation.format import NAMES, counted, interval, percent, signed, types
 from hno.evaluation.outcome import pooled
 
@@ -47,11 +50,47 @@ class Job(NamedTuple):
         return cls(number, Path(hydra.runtime.output_dir), settings)
 
     def results(self) -> dict[str, Any]:
-        """Content of its results.json; without one that can be read, a failure that says so."""
+        """Content of its results.json; without one that can be read, or with one that has no end, a failure."""
         try:
-            return dict(json.loads((self.folder / "results.json").read_text()))
+            found = dict(json.loads((self.folder / "results.json").read_text()))
         except (OSError, TypeError, ValueError) as error:
             return {"status": "failed", "reason": f"no results ({error})"}
+        if found.get("status") == "running":  # the sweep is over
+            return {**found, "status": "failed", "reason": "its process ended before the job did"}
+        return found
+
+
+class Entry(NamedTuple):
+    """A job in the ledger."""
+
+    job: Job
+    succeeded: bool = False
+
+
+class Ledger(NamedTuple):
+    """Which jobs of a multirun began and which succeeded, in a folder that every process of the sweep can write."""
+
+    folder: Path
+
+    @classmethod
+    @contextmanager
+    def within(cls, sweep: Path) -> Iterator[Ledger]:
+        """A new ledger in the folder of a sweep, which is gone afterwards."""
+        sweep.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=".jobs-", dir=sweep, ignore_cleanup_errors=True) as folder:
+            yield cls(Path(folder))
+
+    def write(self, entry: Entry) -> None:
+        """Add a job, or replace its entry."""
+        number, folder, settings = entry.job
+        content = {"job": [number, str(folder), settings], "succeeded": entry.succeeded}
+        write_json(self.folder / f"{number}.json", content)
+
+    def entries(self) -> list[Entry]:
+        """Jobs that began, in their order."""
+        found = [json.loads(path.read_text()) for path in self.folder.glob("*.json")]
+        jobs = [(*entry["job"], entry["succeeded"]) for entry in found]
+        return [Entry(Job(n, Path(at), tuple(settings)), done) for n, at, settings, done in sorted(jobs)]
 
 
 def show_jobs(jobs: Sequence[Job]) -> None:

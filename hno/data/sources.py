@@ -15,7 +15,7 @@ from hno.pontryagin.adjoint import gradient_of
 from hno.registry import Registry, check_options
 from hno.types import Points
 
-sources: Registry[Source] = Registry("source", "hno.data")
+sources: Registry[Source] = Registry("source", "hno.data", base="hno.data.sources:Source")
 
 
 class Pool(NamedTuple):

@@ -17,7 +17,7 @@ from hno.games import Game
 from hno.registry import Registry
 from hno.types import Extremal, Trajectory
 
-sections: Registry[Section] = Registry("section", "hno.evaluation")
+sections: Registry[Section] = Registry("section", "hno.evaluation", base="hno.evaluation.sections:Section")
 Type = tuple[float, ...]
 """Types of all players."""
 

@@ -17,7 +17,7 @@ from hno.games.final import FinalMethods
 from hno.games.fingerprint import fingerprint
 from hno.registry import Registry
 
-games: Registry[Game] = Registry("game", "hno.games")
+games: Registry[Game] = Registry("game", "hno.games", base="hno.games.base:Game")
 REQUIRED = ("horizon", "state_box", "initial_box", "control_box", "type_box")
 """What every game sets, as attributes of its class or in its constructor."""
 

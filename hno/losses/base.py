@@ -13,7 +13,7 @@ from hno.games.potential import Problem
 from hno.registry import Registry
 from hno.types import Field, Points, PotentialField, Sample
 
-losses: Registry[LossTerm] = Registry("loss", "hno.losses")
+losses: Registry[LossTerm] = Registry("loss", "hno.losses", base="hno.losses.base:LossTerm")
 
 STREAMS = frozenset({"bvp", "interior", "terminal"})
 """Labelled rows, collocation points inside the window, and points at tau = 0."""

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from hno.registry import Registry
 
-activations: Registry[Activation] = Registry("activation", "hno.operators")
+activations: Registry[Activation] = Registry("activation", "hno.operators", base="hno.operators.activations:Activation")
 
 
 class Activation(nn.Module, abc.ABC):

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from hno.registry import Registry
 
-networks: Registry[Network] = Registry("network", "hno.operators")
+networks: Registry[Network] = Registry("network", "hno.operators", base="hno.operators.network:Network")
 
 
 class Inputs(NamedTuple):

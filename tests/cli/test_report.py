@@ -33,8 +33,8 @@ def test_out_chooses_the_file(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["nothing", "."])
-def test_a_folder_without_runs_ends_with_one_and_says_why(tmp_path, capsys, name):
-    assert main(["report", str(tmp_path / name)]) == 1
+def test_a_folder_without_runs_is_refused_and_says_why(tmp_path, capsys, name):
+    assert main(["report", str(tmp_path / name)]) == 2
     said = capsys.readouterr()
     assert said.out == ""
     assert "no results.json" in said.err or "not a folder" in said.err
