@@ -49,6 +49,7 @@ class Settings:
     """Time for which validation episodes hold a control, s."""
     accelerator: str = "auto"
     devices: int | str | list[int] = 1
+    """One device: 1, or its number in a list."""
     precision: Any = "32-true"
     gradient_clip_val: float | None = None
     polish: int = 0
@@ -152,12 +153,16 @@ def fit(
 def make_trainer(
     settings: Settings, folder: Path, loggers: Sequence[Logger], callbacks: Sequence[L.Callback], *, validates: bool
 ) -> L.Trainer:
-    """A trainer that runs for a number of steps and leaves `last.ckpt`; it validates where there are held-out rows."""
+    """A trainer that runs for a number of steps and leaves `last.ckpt`; it validates where there are held-out rows.
+
+    Raises:
+        ValueError: there is no such accelerator or precision, or there are several devices.
+    """
     every = settings.validate_every
     keeping_last = ModelCheckpoint(
         folder, Path(LAST).stem, every_n_train_steps=every, save_on_train_epoch_end=False, enable_version_counter=False
     )
-    return L.Trainer(
+    trainer = L.Trainer(
         accelerator=settings.accelerator,
         devices=settings.devices,
         precision=settings.precision,
@@ -176,3 +181,9 @@ def make_trainer(
         default_root_dir=folder,
         inference_mode=False,
     )
+    if trainer.world_size > 1:
+        raise ValueError(
+            f"trainer.devices={settings.devices} asks for {trainer.world_size} devices; a run trains on one. Choose it "
+            "with trainer.devices=1 or its number, [1], and put several devices to use with one run on each."
+        )
+    return trainer
