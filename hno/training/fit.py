@@ -16,6 +16,7 @@ from lightning.pytorch.loggers import Logger
 
 from hno.data import GameData
 from hno.data.certificates import safe_sets
+from hno.data.folders import check_room
 from hno.losses import Objective, Scales
 from hno.operators import ValueOperator
 from hno.training.adaptive import Adaptive, AdaptiveLabels, Round
@@ -111,6 +112,7 @@ def fit(
 
     Raises:
         DivergedError: the loss, or the error on held-out labels, is no longer sound.
+        OSError: the checkpoints do not fit into the folder.
     """
     if data.potential != operator.potential:
         raise ValueError(
@@ -131,6 +133,7 @@ def fit(
     plan = data.labels
     adding = AdaptiveLabels(settings.adaptive, settings.steps, data.seed, settings.dt, plan.solver, plan.workers)
     trainer = make_trainer(settings, folder, loggers, [adding, watch, *callbacks], validates=data.val_rows is not None)
+    _check_room(folder, operator)
     began = time.perf_counter()
     trainer.fit(module, datamodule=data, ckpt_path=resume, weights_only=True)
     if settings.polish:
@@ -148,6 +151,12 @@ def fit(
         metrics |= trainer.validate(module, datamodule=data, verbose=False)[0]
     checkpoint = folder / (LAST if watch.best is None else BEST)  # a best one of another run does not count
     return Fitted(trainer, checkpoint, metrics, watch.best, adding.done, seconds)
+
+
+def _check_room(folder: Path, operator: ValueOperator) -> None:
+    """Refuse a folder without room for the checkpoints: weights and two moments, and a draft beside those kept."""
+    weights = sum(parameter.nbytes for parameter in operator.parameters())
+    check_room(folder, 3 * 3 * weights, "Checkpoints", "choose another folder")
 
 
 def make_trainer(
