@@ -36,7 +36,7 @@ def claimed(path: Path, timeout: float = 0.0) -> Iterator[bool]:
     Raises:
         OSError: the file system has no locks.
     """
-    lock = filelock.FileLock(path)
+    lock: filelock.BaseFileLock = filelock.FileLock(path)
     try:
         lock.acquire(timeout=timeout)
     except filelock.Timeout:

@@ -1,4 +1,4 @@
-"""Full, limited and read-only disks: what was there stays whole, nothing is left half-written, and a message says why."""
+"""Full, limited and read-only disks: what was there stays whole, no half file is left, and a message says why."""
 
 from __future__ import annotations
 

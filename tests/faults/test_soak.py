@@ -33,7 +33,8 @@ class Watch(L.Callback):
     """
 
     def __init__(self, folder: Path) -> None:
-        self.folder, self.memory, self.handles, self.files, self.disk = folder, *([] for _ in range(4))  # type: ignore[misc]
+        self.folder = folder
+        self.memory, self.handles, self.files, self.disk = list[int](), list[int](), list[int](), list[int]()
 
     def on_train_batch_end(self, trainer: L.Trainer, *others: Any) -> None:
         if trainer.global_step % 1000 == 1:
@@ -54,14 +55,22 @@ def test_ten_thousand_steps_with_saving_and_validation_take_no_more_than_two_tho
     weights = {"value": 1.0, "costate": 1.0, "residual": 0.1, "boundary": 0.1}
     settings = Settings(steps=STEPS, validate_every=EVERY, accelerator="cpu", dt=0.5, compile=False)
     loggers = [CSVLogger(tmp_path, "csv", "")]
-    fit(operator, make_objective(weights), data, settings, tmp_path, loggers=loggers, callbacks=[watch])
+    fit(
+        operator,
+        make_objective({name: {} for name in weights}, weights),
+        data,
+        settings,
+        tmp_path,
+        loggers=loggers,
+        callbacks=[watch],
+    )
     assert len(watch.memory) == STEPS // 1000
     assert max(watch.handles[2:]) <= watch.handles[1]
     assert max(watch.files[2:]) <= watch.files[1]
     assert max(watch.disk[2:]) <= 1.02 * watch.disk[1]
     growth = watch.memory[-1] - watch.memory[1]
     print(
-        f"1 case: {STEPS} steps, saved and validated {STEPS // EVERY} times; memory {growth / 2**20:+.1f} MiB from step "
-        f"1,000 on, {watch.handles[-1]} open files, {watch.files[-1]} files of {watch.disk[-1] / 1e6:.1f} MB"
+        f"1 case: {STEPS} steps, saved and validated {STEPS // EVERY} times; memory {growth / 2**20:+.1f} MiB from "
+        f"step 1,000 on, {watch.handles[-1]} open files, {watch.files[-1]} files of {watch.disk[-1] / 1e6:.1f} MB"
     )
     assert growth < 30 * 2**20
