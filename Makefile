@@ -27,7 +27,7 @@ $(STAMP): pyproject.toml constraints.txt
 
 .PHONY: help
 help: ## list the targets
-	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "%-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "%-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
 .PHONY: train
 train: $(STAMP) ## train and evaluate; overrides in ARGS, e.g. ARGS="game=drone"
@@ -42,6 +42,14 @@ lint: $(STAMP) ## ruff and mypy
 .PHONY: test
 test: lint ## lint, then the tests that are not slow; more options in ARGS
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 $(ARGS)
+
+.PHONY: test-faults
+test-faults: $(STAMP) ## every injected fault, the long ones too; prints how many cases each test tried
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest tests/faults -m "slow or not slow" -rpP $(ARGS)
+
+.PHONY: licences
+licences: $(STAMP) ## the licence of every installed package, hno's dependencies and the tools'
+	@$(BIN)/python benchmarks/licences.py
 
 # The site is built from the sources' text: neither hno nor torch is installed here, which makes it a matter of seconds.
 DOCS := .venv-docs

@@ -6,11 +6,12 @@ import warnings
 from pathlib import Path
 from typing import NamedTuple
 
+from lightning.fabric.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig
 
 from hno.cli.config import read
 from hno.cli.evaluate import check_evaluation, unseen_types
-from hno.cli.logs import check_wandb
+from hno.cli.logs import check_wandb, quiet_lightning
 from hno.cli.settings import TrainSettings
 from hno.data import Collocation, GameData, LabelPlan, make_sampler
 from hno.data.curriculum import Curriculum
@@ -22,7 +23,7 @@ from hno.losses import Objective, make_objective
 from hno.operators import Architecture, Choice, ValueOperator, make_operator
 from hno.training.adaptive import Adaptive
 from hno.training.checkpoint import find_checkpoint
-from hno.training.fit import Settings
+from hno.training.fit import Settings, make_trainer
 from hno.training.optimizers import make_optimizer
 from hno.training.saving import RESUMED
 
@@ -53,11 +54,20 @@ def check(config: DictConfig) -> TrainSettings:
         if settings.validation.types is not None:
             parse_types(game, settings.validation.types, key="validation.types")
         make_optimizer(steps=settings.trainer.max_steps, **settings.optimizer)
+        _check_device(settings)
         if settings.evaluation.ntk:
             check_rows(built.operator, settings.evaluation.ntk_rows)
     if settings.resume is not None:
         find_checkpoint(settings.resume, RESUMED)
     return settings
+
+
+def _check_device(settings: TrainSettings) -> None:
+    try:
+        with quiet_lightning():
+            make_trainer(how_to_train(settings), Path(), [], [], validates=False)
+    except (MisconfigurationException, TypeError, ImportError) as error:
+        raise ValueError(f"trainer.accelerator, trainer.devices or trainer.precision: {error}") from error
 
 
 def build(settings: TrainSettings, report: Report | None = None) -> Built:

@@ -7,7 +7,7 @@ import inspect
 import math
 import os
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,11 +16,14 @@ import torch
 from torch import Tensor
 
 from hno.data.certificates import CLEARANCE, safe
+from hno.data.folders import POLL, Waiting, check_room
 from hno.data.shards import SHARD, LabelSet
 from hno.data.store import canonical_json
 from hno.data.ties import APART, HALVINGS, TIE, tie_states
 from hno.games import Game
+from hno.pontryagin.mesh import label_times
 from hno.pontryagin.solve import Solver, solve
+from hno.pontryagin.threads import cores
 from hno.types import Extremal, Status, best_of, of_starts, part
 
 SOLVER_VERSION = 2
@@ -153,7 +156,7 @@ def labels_for(
         requests: what is needed.
         cache: folder of label sets.
         settings: solver settings, part of the cache key.
-        workers: processes with one thread each; the number of cores by default.
+        workers: processes with one thread each; as many as the job has cores by default.
         report: called as labels are written.
 
     Returns:
@@ -161,12 +164,14 @@ def labels_for(
 
     Raises:
         LabelFileError: a cached file is damaged.
-        OSError: the cache cannot be written to.
+        OSError: the cache cannot be written to, or what is missing does not fit there.
     """
     began = time.perf_counter()
     sets = [label_set(game, request, cache, settings) for request in requests]
     jobs = [job for labels, request in zip(sets, requests, strict=True) for job in _jobs(game, labels, request)]
     total, done, converged = sum(len(job.x0) - job.have for job in jobs), 0, 0
+    if jobs:
+        check_room(cache, label_bytes(game, total), f"Labels of {total} start states", "choose another with $HNO_CACHE")
     for status in _run(game, jobs, settings, workers):
         done += len(status)
         converged += int((status == Status.CONVERGED).sum())
@@ -176,6 +181,13 @@ def labels_for(
         labels.write_manifest()
     found = [labels.read(request.starts) for labels, request in zip(sets, requests, strict=True)]
     return found, time.perf_counter() - began
+
+
+def label_bytes(game: Game, starts: int) -> int:
+    """Size of the labels of so many start states, if each has one equilibrium."""
+    players, nodes = game.players, len(label_times(game, dtype=torch.float64, device=torch.device("cpu")))
+    node = players * (1 + players) * game.state_dim + players * game.control_dim + players + 1
+    return 8 * starts * nodes * node
 
 
 def safe_labels_for(
@@ -256,28 +268,54 @@ def _jobs(game: Game, labels: LabelSet, request: Request) -> Iterator[_Job]:
 
 
 def _run(game: Game, jobs: Sequence[_Job], settings: Solver, workers: int | None) -> Iterator[Tensor]:
-    """The status of every newly solved row, shard by shard."""
-    workers = min(workers or os.cpu_count() or 1, len(jobs))
+    """The status of every row that was missing, shard by shard; those that other processes solve are waited for."""
+    left, waiting = dict(enumerate(jobs)), Waiting()
+    while left:
+        free = {number: job for number, job in left.items() if not _taken(job)}
+        for number, status in _solved(game, free, settings, workers):
+            if status is not None:
+                del left[number]
+                yield status
+                waiting = Waiting()
+        if left:
+            waiting.announce(next(job.labels.claim_path(job.shard) for job in left.values()))
+            time.sleep(POLL)
+
+
+def _taken(job: _Job) -> bool:
+    """Whether another process is solving a shard."""
+    with job.labels.claim(job.shard) as ours:
+        return not ours
+
+
+def _solved(
+    game: Game, jobs: Mapping[int, _Job], settings: Solver, workers: int | None
+) -> Iterator[tuple[int, Tensor | None]]:
+    """What `_solve_shard` answers for each job."""
+    workers = min(workers or cores(), len(jobs))
     if workers <= 1:
-        return (_solve_shard(game, job, settings) for job in jobs)
+        return ((number, _solve_shard(game, job, settings)) for number, job in jobs.items())
     pool = joblib.Parallel(n_jobs=workers, return_as="generator_unordered", inner_max_num_threads=1, backend="loky")
-    return pool(joblib.delayed(_solve_alone)(game, job, settings) for job in jobs)
+    return pool(joblib.delayed(_solve_alone)(number, game, job, settings) for number, job in jobs.items())
 
 
-def _solve_alone(game: Game, job: _Job, settings: Solver) -> Tensor:
+def _solve_alone(number: int, game: Game, job: _Job, settings: Solver) -> tuple[int, Tensor | None]:
     torch.set_num_threads(1)
-    return _solve_shard(game, job, settings)
+    return number, _solve_shard(game, job, settings)
 
 
-def _solve_shard(game: Game, job: _Job, settings: Solver) -> Tensor:
+def _solve_shard(game: Game, job: _Job, settings: Solver) -> Tensor | None:
     """Solve the start states that a shard lacks and write it; another process may have done so meanwhile.
 
     Returns:
-        The status of the best extremal of each of them.
+        The status of the best extremal of each of them; None where another process is solving them.
     """
-    have = job.labels.starts(job.shard)
-    x0 = job.x0[have:]
-    if len(x0) > 0:
-        theta = torch.tensor(job.theta, dtype=torch.float64).expand(len(x0), -1)
-        job.labels.append(job.shard, have, solve(game, x0, theta, settings, all_equilibria=job.all_equilibria))
+    with job.labels.claim(job.shard) as ours:
+        if not ours:
+            return None
+        have = job.labels.starts(job.shard)
+        x0 = job.x0[have:]
+        if len(x0) > 0:
+            theta = torch.tensor(job.theta, dtype=torch.float64).expand(len(x0), -1)
+            job.labels.append(job.shard, have, solve(game, x0, theta, settings, all_equilibria=job.all_equilibria))
     return best_of(of_starts(job.labels.read_shard(job.shard), job.have, len(job.x0))).status

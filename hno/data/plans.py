@@ -34,7 +34,7 @@ class LabelPlan:
     """Folder of label files; $HNO_CACHE or the user's cache folder by default."""
     solver: Solver = Solver()
     workers: int | None = None
-    """Label processes; the number of cores by default."""
+    """Label processes; as many as the job has cores by default."""
 
     def shares(self, number: int) -> list[int]:
         """So many trajectories in equal shares, one for each width; what cannot be shared goes to the first ones."""

@@ -6,14 +6,14 @@ import json
 import os
 import tempfile
 from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import filelock
-
 from hno.data.certificates import summary
+from hno.data.folders import claimed, locked
 from hno.data.store import (
     LabelFileError,
     canonical_json,
@@ -101,6 +101,9 @@ class LabelSet:
         with self._lock():
             for draft in self._drafts():  # left by a killed process: who writes holds the lock
                 draft.unlink()
+            for left in self.folder.glob(".claim-*"):
+                with claimed(left):  # which removes it, if nobody is solving
+                    pass
             shards = self._shards()
             found = [self.read_shard(_number(shard["file"])) for shard in shards]
             content = {
@@ -137,8 +140,16 @@ class LabelSet:
                 f"Labels cannot be written to {self.folder} ({error}). Choose another folder with $HNO_CACHE."
             ) from error
 
-    def _lock(self) -> filelock.BaseFileLock:
-        return filelock.FileLock(self.folder / ".lock")
+    def claim_path(self, shard: int) -> Path:
+        """Lock file of who solves a shard."""
+        return self.folder / f".claim-{shard:05}"
+
+    def claim(self, shard: int) -> AbstractContextManager[bool]:
+        """Whether a shard is for this process to solve, in the block; no other process solves it meanwhile."""
+        return claimed(self.claim_path(shard))
+
+    def _lock(self) -> AbstractContextManager[None]:
+        return locked(self.folder / ".lock")
 
 
 def _number(name: str) -> int:

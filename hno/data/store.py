@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
@@ -54,18 +55,28 @@ def replace_whole(path: Path, write: Callable[[Path], object]) -> None:
     Args:
         path: the file; its folder is made where it is missing.
         write: fills the file at the path that it gets.
+
+    Raises:
+        OSError: with the path, where it cannot be written: a full disk, a quota, a read-only folder.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    os.close(handle)
-    draft = Path(name)
+    draft = None
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+        os.close(handle)
+        draft = Path(name)
         write(draft)
         draft.chmod(0o644)
         draft.replace(path)
-    except BaseException:
-        draft.unlink(missing_ok=True)
-        raise
+    except (OSError, safetensors.SafetensorError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise OSError(
+            f"{path} could not be written ({reason}); what was there before is whole. Free some space, or choose "
+            "another folder."
+        ) from error
+    finally:
+        if draft is not None:
+            draft.unlink(missing_ok=True)
 
 
 def read_labels(path: Path) -> tuple[Extremal, dict[str, Any]]:
@@ -82,7 +93,7 @@ def read_labels(path: Path) -> tuple[Extremal, dict[str, Any]]:
             metadata = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
     except (safetensors.SafetensorError, OSError) as error:
-        raise LabelFileError(f"{path} cannot be read as a label file ({error}). {_ADVICE}") from error
+        raise LabelFileError(f"{path} cannot be read as a label file ({error}). {_advice(error)}") from error
     try:
         header = json.loads(metadata[KEY])
         found = header["format"], header["sha256"], header["provenance"]
@@ -116,7 +127,7 @@ def start_count(path: Path) -> int:
             header = json.loads((file.metadata() or {}).get(KEY, "{}"))
             return int(header.get("starts", file.get_slice("status").get_shape()[0]))
     except (safetensors.SafetensorError, OSError, ValueError, TypeError) as error:
-        raise LabelFileError(f"{path} cannot be read as a label file ({error}). {_ADVICE}") from error
+        raise LabelFileError(f"{path} cannot be read as a label file ({error}). {_advice(error)}") from error
 
 
 def checksum(path: Path) -> str:
@@ -133,6 +144,12 @@ def checksum(path: Path) -> str:
 
 
 _ADVICE = "Move it away and run again; the labels are then solved anew."
+
+
+def _advice(error: Exception) -> str:
+    """What to do about a file that cannot be opened: safetensors map files into memory, which not every disk can."""
+    unmapped = getattr(error, "errno", None) == errno.ENODEV or "os error 19" in str(error)
+    return "Its disk cannot map files into memory: choose another folder with $HNO_CACHE." if unmapped else _ADVICE
 
 
 def _digest(tensors: Mapping[str, Tensor]) -> str:

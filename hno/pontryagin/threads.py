@@ -1,11 +1,21 @@
-"""How many threads torch uses for small work."""
+"""How many threads torch uses for small work, and how many processes solve labels."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+import joblib
 import torch
+
+
+def cores() -> int:
+    """Cores that this job may use, which may be fewer than the machine has.
+
+    The fewest that its CPU affinity, its cgroup, Slurm's `--cpus-per-task` and $LOKY_MAX_CPU_COUNT say.
+    """
+    return min(joblib.cpu_count(), int(os.environ.get("SLURM_CPUS_PER_TASK") or os.cpu_count() or 1))
 
 
 @contextmanager

@@ -25,6 +25,7 @@ from hno.data.datamodule import mix
 from hno.games import Game
 from hno.pontryagin.online import subgame
 from hno.pontryagin.solve import Solver, solve
+from hno.pontryagin.threads import cores
 from hno.training.module import TrainingModule
 from hno.types import Extremal, Status, best_of, join, part
 
@@ -177,7 +178,7 @@ class AdaptiveLabels(L.Callback):
     def _solved(self, data: GameData, group: Candidates, rows: Tensor) -> Extremal:
         game, x0, theta = subgame(data.game, group.tau), group.x[rows].double(), group.theta[rows].double()
         jobs = list(zip(x0.split(CHUNK), theta.split(CHUNK), strict=True))
-        workers = min(self.workers or joblib.cpu_count(), len(jobs))
+        workers = min(self.workers or cores(), len(jobs))
         pool = joblib.Parallel(n_jobs=workers, inner_max_num_threads=1, backend="loky")
         call = joblib.delayed(solve)
         return join(pool(call(game, *job, self.solver, all_equilibria=data.potential) for job in jobs))

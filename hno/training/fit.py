@@ -16,6 +16,7 @@ from lightning.pytorch.loggers import Logger
 
 from hno.data import GameData
 from hno.data.certificates import safe_sets
+from hno.data.folders import check_room
 from hno.losses import Objective, Scales
 from hno.operators import ValueOperator
 from hno.training.adaptive import Adaptive, AdaptiveLabels, Round
@@ -49,6 +50,7 @@ class Settings:
     """Time for which validation episodes hold a control, s."""
     accelerator: str = "auto"
     devices: int | str | list[int] = 1
+    """One device: 1, or its number in a list."""
     precision: Any = "32-true"
     gradient_clip_val: float | None = None
     polish: int = 0
@@ -111,6 +113,7 @@ def fit(
     Raises:
         DivergedError: the loss, a gradient, a weight, or the error on held-out labels is no longer sound.
         CheckpointError: the training cannot go on from the checkpoint.
+        OSError: the checkpoints do not fit into the folder.
     """
     if data.potential != operator.potential:
         raise ValueError(
@@ -135,6 +138,7 @@ def fit(
     if resume is not None:
         check_training_state(resume, read_content(resume), settings.steps)
         watch.resumes = same_run(folder / BEST, resume)
+    _check_room(folder, operator)
     began = time.perf_counter()
     try:
         trainer.fit(module, datamodule=data, ckpt_path=resume, weights_only=True)
@@ -159,15 +163,25 @@ def fit(
     return Fitted(trainer, checkpoint, metrics, watch.best, adding.done, seconds)
 
 
+def _check_room(folder: Path, operator: ValueOperator) -> None:
+    """Refuse a folder without room for the checkpoints: weights and two moments, and a draft beside those kept."""
+    weights = sum(parameter.nbytes for parameter in operator.parameters())
+    check_room(folder, 3 * 3 * weights, "Checkpoints", "choose another folder")
+
+
 def make_trainer(
     settings: Settings, folder: Path, loggers: Sequence[Logger], callbacks: Sequence[L.Callback], *, validates: bool
 ) -> L.Trainer:
-    """A trainer that runs for a number of steps and leaves `last.ckpt`; it validates where there are held-out rows."""
+    """A trainer that runs for a number of steps and leaves `last.ckpt`; it validates where there are held-out rows.
+
+    Raises:
+        ValueError: there is no such accelerator or precision, or there are several devices.
+    """
     every, files = settings.validate_every, CheckpointFiles()
     keeping_last = ModelCheckpoint(
         folder, Path(LAST).stem, every_n_train_steps=every, save_on_train_epoch_end=False, enable_version_counter=False
     )
-    return L.Trainer(
+    trainer = L.Trainer(
         accelerator=settings.accelerator,
         devices=settings.devices,
         precision=settings.precision,
@@ -187,3 +201,9 @@ def make_trainer(
         default_root_dir=folder,
         inference_mode=False,
     )
+    if trainer.world_size > 1:
+        raise ValueError(
+            f"trainer.devices={settings.devices} asks for {trainer.world_size} devices; a run trains on one. Choose it "
+            "with trainer.devices=1 or its number, [1], and put several devices to use with one run on each."
+        )
+    return trainer

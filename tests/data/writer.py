@@ -25,7 +25,7 @@ def write(cache: Path, starts: int, workers: int = 1) -> None:
     labels.labels_for(make("narrow_road"), requests, cache, workers=workers)
 
 
-def _solve_alone(game: Game, job: labels._Job, settings: Solver) -> Tensor:
+def _solve_alone(number: int, game: Game, job: labels._Job, settings: Solver) -> tuple[int, Tensor | None]:
     """What worker processes run; they import the package anew."""
     labels.solve = fake_solve
-    return labels._solve_shard(game, job, settings)
+    return number, labels._solve_shard(game, job, settings)

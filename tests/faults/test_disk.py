@@ -1,0 +1,179 @@
+"""Full, limited and read-only disks: what was there stays whole, no half file is left, and a message says why."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import resource
+import subprocess
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import safetensors
+
+from hno.cli.results import Results
+from hno.data import folders
+from hno.data.labels import Request, label_bytes, label_set, labels_for
+from hno.data.store import LabelFileError, read_labels, start_count, write_labels
+from hno.games import make
+from hno.training.fit import _check_room
+from tests.cli import conftest as cli
+from tests.cli.conftest import Command
+from tests.data import conftest
+from tests.data.conftest import Asked
+from tests.fakes import fake_labels
+from tests.operators.conftest import small_operator
+
+asked, command, clean_globals, no_pages = conftest.asked, cli.command, cli.clean_globals, cli.no_pages
+REQUEST = Request((1.0, 5.0), 6, 0, "train")
+
+
+def mounted(folder: Path, options: str) -> None:
+    found = subprocess.run(["mount", "-t", "tmpfs", "-o", options, "tmpfs", folder], capture_output=True, check=False)
+    if found.returncode:
+        pytest.skip("only root may mount a disk")
+
+
+@pytest.fixture
+def disk(tmp_path: Path) -> Iterator[Path]:
+    """A disk of 4 MB."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mounted(folder, "size=4m")
+    yield folder
+    subprocess.run(["umount", "-l", folder], check=True)
+
+
+@pytest.fixture
+def quota(tmp_path: Path) -> Iterator[Path]:
+    """A folder in which no file grows beyond what `fill` leaves."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    yield tmp_path
+    resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@pytest.fixture(params=["disk", "quota"])
+def place(request: pytest.FixtureRequest) -> Path:
+    return request.getfixturevalue(request.param)
+
+
+def fill(place: Path) -> None:
+    """Leave room for two pages."""
+    if not os.path.ismount(place):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (8192, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
+        return
+    free = os.statvfs(place)
+    (place / "filler").write_bytes(bytes(free.f_bavail * free.f_frsize - 8192))
+
+
+def read_only(folder: Path) -> None:
+    subprocess.run(["mount", "-o", "remount,ro", folder], check=True)
+
+
+def files(place: Path) -> dict[str, bytes]:
+    found = [path for path in place.rglob("*") if path.is_file() and path.name != "filler"]
+    return {str(path.relative_to(place)): path.read_bytes() for path in found}
+
+
+def test_a_label_file_that_does_not_fit_leaves_the_one_that_was_there(place: Path) -> None:
+    path, game = place / "labels.safetensors", make("narrow_road")
+    write_labels(path, fake_labels(game, count=1), {})
+    before = files(place)
+    fill(place)
+    with pytest.raises(OSError, match=rf"{path} could not be written .*Free some space"):
+        write_labels(path, fake_labels(game, count=40, seed=1), {})
+    assert files(place) == before
+    assert read_labels(path)[0].starts == 1
+
+
+def test_results_that_do_not_fit_leave_those_that_were_there(place: Path) -> None:
+    results = Results(place / "results.json", {"game": "any"})
+    before = files(place)
+    fill(place)
+    with pytest.raises(OSError, match=r"results\.json could not be written .*what was there before is whole"):
+        results.update(table=[0.5] * 10_000)
+    assert files(place) == before
+    assert json.loads((place / "results.json").read_text())["status"] == "running"
+
+
+def test_a_set_that_does_not_fit_keeps_its_shards(place: Path, asked: Asked) -> None:
+    game = make("narrow_road")
+    labels_for(game, [REQUEST._replace(starts=1)], place, workers=1)
+    before = files(place)
+    fill(place)
+    with pytest.raises(OSError, match=r"could not be written|need .* MB"):
+        labels_for(game, [REQUEST._replace(starts=100)], place, workers=1)
+    assert files(place) == before
+    assert label_set(game, REQUEST, place).read(1).starts == 1
+
+
+def test_a_full_disk_ends_the_labels_command_with_one_message(disk: Path, command: Command, asked: Asked) -> None:
+    fill(disk)
+    run = command("labels", "game=narrow_road", "theta=1,1", "n=100", f"cache={disk}", "workers=1")
+    assert run.code == 1
+    assert "Free some space" in run.text
+    assert "Traceback" not in run.text
+    assert asked.total() == 0
+
+
+def test_a_read_only_cache_is_read_and_refused_before_solving(disk: Path, asked: Asked) -> None:
+    game = make("narrow_road")
+    labels_for(game, [REQUEST], disk, workers=1)
+    before = files(disk)
+    read_only(disk)
+    (found,), _ = labels_for(game, [REQUEST], disk, workers=1)
+    assert found.starts == asked.total() == 6
+    with pytest.raises(OSError, match=r"Labels cannot be written.*\$HNO_CACHE"):
+        labels_for(game, [REQUEST._replace(starts=7)], disk, workers=1)
+    assert asked.total() == 6
+    assert files(disk) == before
+
+
+@pytest.mark.parametrize("name", ["narrow_road", "lane_change", "drone", "intersection"])
+def test_the_size_of_labels_is_known_before(tmp_path: Path, name: str) -> None:
+    game = make(name)
+    path = tmp_path / "labels.safetensors"
+    write_labels(path, fake_labels(game, [1.0] * game.players, 128), {})
+    assert 0.85 < label_bytes(game, 128) / path.stat().st_size <= 1
+
+
+def free(monkeypatch: pytest.MonkeyPatch, size: float) -> None:
+    monkeypatch.setattr(folders.shutil, "disk_usage", lambda folder: SimpleNamespace(free=size))
+
+
+@pytest.mark.parametrize("starts", [1, 128, 100_000])
+def test_labels_that_cannot_fit_are_refused_with_the_numbers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, asked: Asked, starts: int
+) -> None:
+    free(monkeypatch, label_bytes(make("narrow_road"), starts) - 1)
+    with pytest.raises(OSError, match=rf"{starts} start states need [\d.,]+ MB, but .* has [\d.,]+ MB free") as error:
+        labels_for(make("narrow_road"), [REQUEST._replace(starts=starts)], tmp_path, workers=1)
+    assert "$HNO_CACHE" in str(error.value)
+    assert asked.total() == 0
+
+
+def test_checkpoints_that_cannot_fit_are_refused_with_the_numbers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    operator = small_operator(make("narrow_road"))
+    free(monkeypatch, sum(parameter.nbytes for parameter in operator.parameters()))
+    with pytest.raises(OSError, match=r"Checkpoints need [\d.,]+ MB, but"):
+        _check_room(tmp_path / "not" / "yet", operator)
+    free(monkeypatch, 1e9)
+    _check_room(tmp_path / "not" / "yet", operator)
+
+
+@pytest.mark.parametrize("read", [read_labels, start_count])
+@pytest.mark.parametrize("error", [OSError(errno.ENODEV, "No such device"), OSError("No such device (os error 19)")])
+def test_a_disk_that_cannot_map_files_is_named_with_a_way_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, read: Callable[[Path], object], error: OSError
+) -> None:
+    def safe_open(*arguments: object, **options: object) -> None:
+        raise error
+
+    monkeypatch.setattr(safetensors, "safe_open", safe_open)
+    with pytest.raises(LabelFileError, match=r"cannot map files into memory.*\$HNO_CACHE"):
+        read(tmp_path / "labels.safetensors")
