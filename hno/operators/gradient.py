@@ -101,7 +101,7 @@ class GradientOperator(ValueOperator):
         tau, x, theta = points
         y = self.encoding(tau, x, theta).flatten(0, -2)
         raw, gradient = network.value_gradient(y, *self._branch(types or distinct_types(theta)))
-        gradient = gradient.view(*theta.shape, -1)
+        gradient = gradient.view(*theta.shape, gradient.shape[-1])
         value, slope = raw.view_as(theta) * self.value_scale, self.encoding.time_slope(gradient) * self.value_scale
         costate = self.encoding.state_slope(gradient, x, self.value_scale)
         if not self.meets_terminal:

@@ -10,13 +10,14 @@ from pathlib import Path
 from typing import Any, final
 
 import torch
-from torch import Tensor
 
 from hno.control.policy import Feedback
+from hno.control.questions import X
 from hno.games import Game, games, make
 from hno.operators import Architecture, Choice, ValueOperator, make_operator
 from hno.pontryagin.threads import torch_threads
 from hno.registry import UnknownNameError
+from hno.types import Numbers
 
 KEY = "hno"
 """Checkpoint entry that says how to build the operator and where it comes from."""
@@ -174,17 +175,17 @@ class LearnedPolicy(Feedback):
         super().__init__(operator)
         self.architecture, self.provenance, self.threads = architecture, provenance, threads
 
-    def act(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
+    def act(self, tau: Numbers, x: X, theta: Numbers) -> X:
         """As `Feedback.act`, on `threads` threads."""
         with torch_threads(self.threads):
             return super().act(tau, x, theta)
 
-    def value(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
+    def value(self, tau: Numbers, x: X, theta: Numbers) -> X:
         """As `Feedback.value`, on `threads` threads."""
         with torch_threads(self.threads):
             return super().value(tau, x, theta)
 
-    def costate(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
+    def costate(self, tau: Numbers, x: X, theta: Numbers) -> X:
         """As `Feedback.costate`, on `threads` threads."""
         with torch_threads(self.threads):
             return super().costate(tau, x, theta)
