@@ -48,6 +48,7 @@ def check(config: DictConfig) -> TrainSettings:
         unseen_types(game, settings.evaluation.types, "evaluation.types")
         if settings.validation.types is not None:
             parse_types(game, settings.validation.types, key="validation.types")
+        how_to_train(settings)
         make_optimizer(steps=settings.trainer.max_steps, **settings.optimizer)
         if settings.evaluation.ntk:
             check_rows(built.operator, settings.evaluation.ntk_rows)

@@ -30,6 +30,9 @@ log = logging.getLogger(__name__)
 
 LAST = "last.ckpt"
 """Name of the latest checkpoint inside a run's folder."""
+PRECISIONS = ("32-true", "32")
+"""Precisions of Lightning in which a training is sound. The others move the game, its simulation and the scales to 16
+or 64 bits, or compute residuals in 16; the step gains nothing by them, since derivatives are taken in 32 anyway."""
 LONG = 20_000
 """Steps from which on compiling pays: it takes some ten seconds and saves about a millisecond a step."""
 
@@ -50,6 +53,7 @@ class Settings:
     accelerator: str = "auto"
     devices: int | str | list[int] = 1
     precision: Any = "32-true"
+    """One of `PRECISIONS`."""
     gradient_clip_val: float | None = None
     polish: int = 0
     """Iterations of L-BFGS on all labelled rows after the last step."""
@@ -57,6 +61,14 @@ class Settings:
     """Labels that are added while training."""
     compile: bool = True
     """`torch.compile` in runs of at least `LONG` steps."""
+
+    def __post_init__(self) -> None:
+        """Refuse, with a ValueError, a precision in which simulation and residuals would be wrong."""
+        if str(self.precision) not in PRECISIONS:
+            raise ValueError(
+                f"trainer.precision must be {PRECISIONS[0]}; got {self.precision!r}. Others would compute residuals or "
+                "move the game and its simulation in 16 or 64 bits."
+            )
 
 
 _LEARNED = {False: "the players' values", True: "a potential"}
