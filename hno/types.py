@@ -291,5 +291,5 @@ class Trajectory(NamedTuple):
 
     @property
     def lost(self) -> Tensor:
-        """Which episodes do not stay finite, in states, controls or costs, shape (B,); they count as collisions."""
-        return ~(self.x.flatten(1).isfinite().all(-1) & self.value.isfinite().all(-1) & ~self.clearance.isnan())
+        """Which episodes have states that are not finite, or a clearance or cost that is NaN, shape (B,)."""
+        return ~self.x.flatten(1).isfinite().all(-1) | self.value.isnan().any(-1) | self.clearance.isnan()

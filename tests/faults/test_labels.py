@@ -128,7 +128,7 @@ FLAWS: dict[str, tuple[Callable[[Extremal], dict[str, Tensor]], str]] = {
     "absurd starts": (changed("start", at(3, value=10**15)), "start must count"),
     "another dtype": (
         lambda labels: {"value": labels.value.to(torch.int64)},
-        "value cannot be converted|value holds torch.int64",
+        "value (cannot|holds)",
     ),
     "status as floats": (lambda labels: {"status": labels.status.double()}, "status holds torch.float64"),
     "fewer players": (lambda labels: {"value": labels.value[..., :1].contiguous()}, "value has shape"),

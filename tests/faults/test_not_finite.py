@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from typing import Any
 
 import pytest
@@ -69,7 +70,6 @@ def test_no_label_is_made_of_nan(methods: dict[str, Any]) -> None:
 
 
 def test_a_certificate_that_is_nan_is_no_label(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        "hno.pontryagin.solve.reintegration_error", lambda game, at: torch.full((len(at.t),), torch.nan).double()
-    )
+    unknown = lambda game, at: torch.full((len(at.t),), torch.nan, dtype=torch.float64)  # noqa: E731
+    monkeypatch.setattr(sys.modules["hno.pontryagin.solve"], "reintegration_error", unknown)
     assert solve(Walkers(), starts()[:1], torch.ones(1, 2)).status.tolist() == [Status.NOT_FINITE]
