@@ -151,7 +151,7 @@ class Feedback(nn.Module, Policy):
         asked = question(self.game, tau, x, theta, self.operator.value_scale)
         if not self._warned and bool(outside(self.game, asked.points.x).any()):
             self._warned = True
-            message = "x lies outside the PDE box of the game, where nothing was learned: controls extrapolate."
+            message = "x lies outside the PDE box of the game, where nothing was learned: do not trust answers there."
             warnings.warn(f"{message} This policy says so once.", ExtrapolationWarning, stacklevel=3)
         return asked.answered(answer(asked.points, self.operator.field(asked.points)))
 
