@@ -9,10 +9,37 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from enum import IntEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
+
+Numbers = Tensor | NDArray[Any] | Sequence[Any] | float
+"""What people hand over: tensors, arrays, nested lists and numbers."""
+
+
+def tensor_of(name: str, numbers: Numbers) -> Tensor:
+    """A tensor as it is; arrays, lists and numbers as a floating-point one.
+
+    Raises:
+        ValueError: they are no real numbers, or rows have different lengths.
+    """
+    if isinstance(numbers, Tensor):
+        found = numbers
+    else:
+        try:
+            array = np.asarray(numbers)
+        except ValueError:  # of different lengths
+            array = np.array(None)
+        if array.dtype.kind not in "fiu":
+            raise ValueError(f"{name} must be a tensor or an array of real numbers; got {numbers!r:.80}.")
+        single = array.dtype in (np.float16, np.float32)
+        found = torch.from_numpy(np.array(array, dtype=np.float32 if single else np.float64))
+    if found.is_complex() or found.dtype == torch.bool:
+        raise ValueError(f"{name} must be real numbers; got {found.dtype}.")
+    return found if found.is_floating_point() else found.double()
 
 
 class Points(NamedTuple):
@@ -259,5 +286,10 @@ class Trajectory(NamedTuple):
 
     @property
     def collided(self) -> Tensor:
-        """Which episodes collide, shape (B,): those that keep no positive clearance, NaN too."""
-        return ~(self.clearance > 0)
+        """Which episodes collide, shape (B,): those that keep no positive clearance, and those that are lost."""
+        return ~(self.clearance > 0) | self.lost
+
+    @property
+    def lost(self) -> Tensor:
+        """Which episodes have states that are not finite, or a clearance or cost that is NaN, shape (B,)."""
+        return ~self.x.flatten(1).isfinite().all(-1) | self.value.isnan().any(-1) | self.clearance.isnan()

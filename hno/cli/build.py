@@ -53,6 +53,7 @@ def check(config: DictConfig) -> TrainSettings:
         unseen_types(game, settings.evaluation.types, "evaluation.types")
         if settings.validation.types is not None:
             parse_types(game, settings.validation.types, key="validation.types")
+        how_to_train(settings)
         make_optimizer(steps=settings.trainer.max_steps, **settings.optimizer)
         _check_device(settings)
         if settings.evaluation.ntk:

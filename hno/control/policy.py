@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import abc
+import warnings
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from torch import Tensor, nn
 
+from hno.control.questions import X, in_type_of, outside, question
 from hno.games import Game
+from hno.games.base import ExtrapolationWarning
 from hno.operators.base import ValueOperator
-from hno.types import Points, PotentialField
+from hno.types import Field, Numbers, Points, PotentialField
 
 
 class Policy(abc.ABC):
@@ -68,64 +71,67 @@ class Answer(NamedTuple):
 class Feedback(nn.Module, Policy):
     """The controls that maximise every player's Hamiltonian at an operator's costates (paper, eq. 3).
 
+    Questions are times to go (B,), states (B, P, n) and types (B, P). States may have any leading shape: of one state
+    (P, n) the answer has no B, and none are none. One number is a time to go for all states, one (P,) are the types
+    of all. Numbers, lists and arrays will do; the answer is an array if the states are one, and has their
+    floating-point type. It is not differentiable in the question: see `answer`.
+
     Args:
         operator: a trained operator.
-        checked: refuse wrong shapes and entries that are not finite; without it an operator that has diverged answers
-            NaN, which a rollout counts as a collision.
+        checked: refuse wrong shapes, entries that are not finite and times to go outside the horizon, and warn once of
+            states outside the PDE box. Without it a question consists of tensors of shapes as above, and an operator
+            that has diverged answers NaN, which a rollout counts as a collision.
     """
 
     def __init__(self, operator: ValueOperator, checked: bool = True) -> None:
         super().__init__()
         self.operator, self.checked = operator, checked
+        self._warned = False
 
     @property
     def game(self) -> Game:
         """The game that the policy plays."""
         return self.operator.game
 
-    def forward(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
+    def forward(self, tau: Numbers, x: X, theta: Numbers) -> X:
         """As `act`."""
         return self.act(tau, x, theta)
 
-    def act(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
-        """Controls in physical units, (B,), (B, P, n), (B, P) -> (B, P, m), in the floating-point type of `x`.
+    def act(self, tau: Numbers, x: X, theta: Numbers) -> X:
+        """Controls in physical units, (B, P, m).
 
         Raises:
-            ValueError: shapes do not fit the game or each other, or an entry is not finite.
+            ValueError: shapes do not fit the game or each other, an entry is not finite, or a time to go is not within
+                the horizon.
         """
-        points = self._points(tau, x, theta)
-        return self.operator.problem.optimal_control(points.x, self.operator.field(points).costate).to(x.dtype)
+        problem = self.operator.problem
+        return self._asked(tau, x, theta, lambda at, field: problem.optimal_control(at.x, field.costate))
 
-    def value(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
-        """V_i of every player, (B,), (B, P, n), (B, P) -> (B, P). Raises as `act`."""
-        field = self.operator.field(self._points(tau, x, theta))
-        return (field.players if isinstance(field, PotentialField) else field.value).to(x.dtype)
+    def value(self, tau: Numbers, x: X, theta: Numbers) -> X:
+        """V_i of every player, (B, P). Raises as `act`."""
+        return self._asked(
+            tau, x, theta, lambda at, field: field.players if isinstance(field, PotentialField) else field.value
+        )
 
-    def potential(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
-        """W of an operator of a potential, (B,), (B, P, n), (B, P) -> (B,).
-
-        Raises:
-            ValueError: as `act`, or the operator has none.
-        """
-        return self._potential_field(tau, x, theta).value.squeeze(-1).to(x.dtype)
-
-    def branch(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
-        """Which branch of a potential is played, int64, (B,), (B, P, n), (B, P) -> (B,); see `hno.data.branches`.
+    def potential(self, tau: Numbers, x: X, theta: Numbers) -> X:
+        """W of an operator of a potential, (B,).
 
         Raises:
             ValueError: as `act`, or the operator has none.
         """
-        return self._potential_field(tau, x, theta).branches.argmax(-1)
+        return self._asked(tau, x, theta, lambda at, field: _potential(field).value.squeeze(-1))
 
-    def _potential_field(self, tau: Tensor, x: Tensor, theta: Tensor) -> PotentialField:
-        field = self.operator.field(self._points(tau, x, theta))
-        if not isinstance(field, PotentialField):
-            raise ValueError("This policy knows the players' values, no potential: train it with function=potential.")
-        return field
+    def branch(self, tau: Numbers, x: X, theta: Numbers) -> X:
+        """Which branch of a potential is played, int64, (B,); see `hno.data.branches`.
 
-    def costate(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
-        """dV_i / dx_j, (B,), (B, P, n), (B, P) -> (B, P, P, n), or dW / dx_j, (B, 1, P, n). Raises as `act`."""
-        return self.operator.field(self._points(tau, x, theta)).costate.to(x.dtype)
+        Raises:
+            ValueError: as `act`, or the operator has none.
+        """
+        return self._asked(tau, x, theta, lambda at, field: _potential(field).branches.argmax(-1))
+
+    def costate(self, tau: Numbers, x: X, theta: Numbers) -> X:
+        """dV_i / dx_j, (B, P, P, n), or dW / dx_j, (B, 1, P, n). Raises as `act`."""
+        return self._asked(tau, x, theta, lambda at, field: field.costate)
 
     def answer(self, tau: Tensor, x: Tensor, theta: Tensor) -> Answer:
         """Value, costates and controls of one state, (), (P, n), (P,): a pure function without checks.
@@ -137,11 +143,17 @@ class Feedback(nn.Module, Policy):
         control = self.operator.problem.optimal_control(points.x, costate)
         return Answer(value.to(x.dtype), costate.to(x.dtype), control.to(x.dtype))
 
-    def _points(self, tau: Tensor, x: Tensor, theta: Tensor) -> Points:
-        """The question, checked."""
-        if self.checked:
-            check_question(self.game, tau, x, theta)
-        return self._cast(tau, x, theta)
+    def _asked(self, tau: Any, x: Any, theta: Any, answer: Callable[[Points, Field | PotentialField], Tensor]) -> Any:
+        """What is made of the points and the field there, as the question came."""
+        if not self.checked:
+            points = self._cast(tau, x, theta)
+            return in_type_of(x, answer(points, self.operator.field(points)))
+        asked = question(self.game, tau, x, theta, self.operator.value_scale)
+        if not self._warned and bool(outside(self.game, asked.points.x).any()):
+            self._warned = True
+            message = "x lies outside the PDE box of the game, where nothing was learned: do not trust answers there."
+            warnings.warn(f"{message} This policy says so once.", ExtrapolationWarning, stacklevel=3)
+        return asked.answered(answer(asked.points, self.operator.field(asked.points)))
 
     def _cast(self, tau: Tensor, x: Tensor, theta: Tensor) -> Points:
         """The question in the operator's floating-point type."""
@@ -149,18 +161,7 @@ class Feedback(nn.Module, Policy):
         return Points(tau.to(dtype), x.to(dtype), theta.to(dtype))
 
 
-def check_question(game: Game, tau: Tensor, x: Tensor, theta: Tensor) -> None:
-    """Refuse what a controller has no answer to.
-
-    Raises:
-        ValueError: shapes do not fit the game or each other, or an entry is not finite.
-    """
-    batch, joint = x.shape[:-2], (game.players, game.state_dim)
-    if x.shape[-2:] != joint or tau.shape != batch or theta.shape != (*batch, joint[0]):
-        raise ValueError(
-            f"Expected tau (B,), x (B, {joint[0]}, {joint[1]}) and theta (B, {joint[0]}); "
-            f"got {tuple(tau.shape)}, {tuple(x.shape)} and {tuple(theta.shape)}."
-        )
-    game.check_theta(theta)
-    if not bool(tau.isfinite().all() & x.isfinite().all()):
-        raise ValueError("tau and x must be finite; a controller has no answer to NaN or infinite entries.")
+def _potential(field: Field | PotentialField) -> PotentialField:
+    if not isinstance(field, PotentialField):
+        raise ValueError("This policy knows the players' values, no potential: train it with function=potential.")
+    return field

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable
 
@@ -10,11 +11,14 @@ from torch import Tensor
 
 from hno.control.disturbance import Disturbance, believed, control_noise, normal, state_push
 from hno.control.policy import Policy, as_policy
+from hno.control.questions import starts
 from hno.games import Game
 from hno.games.kinematics import separation
 from hno.pontryagin.integrate import runge_kutta
 from hno.pontryagin.threads import torch_threads
-from hno.types import Trajectory
+from hno.types import Numbers, Trajectory
+
+log = logging.getLogger(__name__)
 
 __all__ = ["Disturbance", "Player", "control_steps", "rollout"]
 
@@ -25,8 +29,8 @@ Player = Policy | Callable[[Tensor, Tensor, Tensor], Tensor]
 def rollout(
     game: Game,
     policy: Player,
-    x0: Tensor,
-    theta: Tensor,
+    x0: Numbers,
+    theta: Numbers,
     dt: float = 0.02,
     substeps: int = 4,
     points: int = 4,
@@ -36,13 +40,13 @@ def rollout(
     """Play the game from every start.
 
     The policy is never asked about states that are not finite: such a row has no controls (NaN) from then on, hence no
-    clearance, and its place in the batch holds its start state.
+    clearance, and its place in the batch holds its start state. It counts as a collision, which a warning says.
 
     Args:
         game: the game.
         policy: feedback controls of all players.
         x0: start states, (B, P, n).
-        theta: player types, (B, P).
+        theta: player types, (B, P), or (P,) for all.
         dt: time for which a control is held, s.
         substeps: Runge-Kutta steps within `dt`.
         points: states, interpolated within each of these, at which constraints and running costs are evaluated.
@@ -50,10 +54,15 @@ def rollout(
         threads: of torch, see `torch_threads`.
 
     Raises:
-        ValueError: the horizon is not a whole multiple of `dt`, or states are pushed that the game does not have.
+        ValueError: shapes do not fit the game, a start is not finite, the horizon is not a whole multiple of `dt`, or
+            states are pushed that the game does not have.
     """
+    first, types = starts(game, x0, theta)
     with torch_threads(threads), torch.no_grad():
-        return _played(game, policy, x0, theta, dt, substeps, points, disturbance)
+        played = _played(game, policy, first, types, dt, substeps, points, disturbance)
+    if lost := int(played.lost.sum()):
+        log.warning("%d of %d episodes do not stay finite: they count as collisions.", lost, len(first))
+    return played
 
 
 def control_steps(game: Game, dt: float) -> int:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.integrate import simpson
 from torch import Tensor
 
+from hno.data.soundness import flaw
 from hno.data.store import LabelFileError, read_labels, write_labels
 from hno.games import Game
 from hno.games.base import own_costate
@@ -44,8 +45,9 @@ def from_arrays(game: Game, arrays: Mapping[str, NDArray[Any]]) -> Extremal:
         arrays: at least `REQUIRED`; controls follow from the costates, and every row counts as converged.
 
     Raises:
-        ValueError: a missing or unknown array, a wrong shape, numbers that are not finite, times that do not increase
-            from 0 to the horizon, or values or costates that do not end at the terminal value and its gradient.
+        ValueError: a missing or unknown array, a wrong shape, numbers that are or become not finite, times that do not
+            increase from 0 to the horizon, or values or costates that do not end at the terminal value and its
+            gradient.
     """
     game = copy.deepcopy(game).cpu().double()
     wrong = [name for name in REQUIRED if name not in arrays] + [name for name in arrays if name not in REQUIRED]
@@ -55,7 +57,10 @@ def from_arrays(game: Game, arrays: Mapping[str, NDArray[Any]]) -> Extremal:
     with torch.inference_mode(False), torch.no_grad():
         _check(game, t, x, costate, value, theta)
         rows = (part.split(CHUNK) for part in (x, costate, value, theta))
-        return join([_certified(game, t, *part) for part in zip(*rows, strict=True)])
+        found = join([_certified(game, t, *part) for part in zip(*rows, strict=True)])
+    if reason := flaw(found, game):
+        raise ValueError(f"The game makes no labels of these arrays: {reason}.")
+    return found
 
 
 def _certified(game: Game, t: Tensor, x: Tensor, costate: Tensor, value: Tensor, theta: Tensor) -> Extremal:
@@ -138,7 +143,7 @@ def read_own(path: Path, game: Game) -> Extremal:
 
     Raises:
         FileNotFoundError: there is no such file.
-        LabelFileError: damaged, or labels of another game or of other constants.
+        LabelFileError: damaged, or labels of another game or of other constants, or none at all.
     """
     if not path.is_file():
         raise FileNotFoundError(f"There is no label file {path}. Write one with hno.data.exchange.write_own.")
@@ -148,6 +153,8 @@ def read_own(path: Path, game: Game) -> Extremal:
         raise LabelFileError(
             f"{path} holds labels of {found['game']} with other physics than {type(game).__name__} here."
         )
+    if reason := flaw(labels, game):
+        raise LabelFileError(f"{path} holds no labels of this game: {reason}.")
     return labels
 
 

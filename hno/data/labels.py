@@ -163,7 +163,7 @@ def labels_for(
         One `Extremal` per request, failed rows included, and the seconds spent on solving.
 
     Raises:
-        LabelFileError: a cached file is damaged.
+        LabelFileError: a cached file is damaged, and the cache cannot be written to; elsewhere it is moved aside.
         OSError: the cache cannot be written to, or what is missing does not fit there.
     """
     began = time.perf_counter()
@@ -256,9 +256,10 @@ class _Job(NamedTuple):
 
 
 def _jobs(game: Game, labels: LabelSet, request: Request) -> Iterator[_Job]:
-    """What a set lacks of a request; what it has is verified."""
+    """What a set lacks of a request; what it has is verified, but for where ties begin, which is solved for."""
     shards = range((request.starts - 1) // SHARD + 1)
-    have = [labels.read_shard(shard).starts if labels.starts(shard) else 0 for shard in shards]
+    known = [None for _ in shards] if request.ties else start_states(game, request).split(SHARD)
+    have = [labels.sound(shard, game, x0) for shard, x0 in zip(shards, known, strict=True)]
     if sum(have) >= request.starts and all(count == SHARD for count in have[:-1]):
         return
     labels.check_writable()

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import logging
 import os
 import tempfile
 from collections.abc import Mapping
@@ -12,9 +14,13 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from torch import Tensor
+
 from hno.data.certificates import summary
 from hno.data.folders import claimed, locked
+from hno.data.soundness import flaw
 from hno.data.store import (
+    ADVICE,
     LabelFileError,
     canonical_json,
     checksum,
@@ -23,7 +29,10 @@ from hno.data.store import (
     start_count,
     write_labels,
 )
-from hno.types import Extremal, join, of_starts
+from hno.games import Game
+from hno.types import Extremal, Status, join, of_starts
+
+log = logging.getLogger(__name__)
 
 SHARD = 128
 """Start states of a shard; the last one of a set may hold fewer until the set grows."""
@@ -59,9 +68,52 @@ class LabelSet:
             LabelFileError: damaged, or made by other settings than its folder says.
         """
         labels, provenance = read_labels(self.path(shard))
+        number = provenance.pop("shard", shard)  # files that are older do not say it
+        if number != shard:
+            raise LabelFileError(f"{self.path(shard)} is shard {number} of its set, under another name. {ADVICE}")
         if canonical_json(provenance) != canonical_json(self.provenance):
-            raise LabelFileError(f"{self.path(shard)} was made by other settings than its folder says. Move it away.")
+            raise LabelFileError(f"{self.path(shard)} was made by other settings than its folder says. {ADVICE}")
         return labels
+
+    def sound(self, shard: int, game: Game, x0: Tensor | None) -> int:
+        """How many start states of a shard are there. One that is damaged or of other starts is moved aside, and said.
+
+        Args:
+            shard: its number.
+            game: what the labels are of.
+            x0: the start states that it should have, or more or fewer of them, (S, P, n); None where nobody knows.
+
+        Raises:
+            LabelFileError: it is damaged, in a folder that cannot be written to.
+        """
+        try:
+            return self._verified(shard, game, x0)
+        except LabelFileError:
+            if not os.access(self.folder, os.W_OK):
+                raise
+        path = self.path(shard)
+        aside = path.with_name(f"{path.name}.damaged")
+        with self._lock():
+            try:
+                return self._verified(shard, game, x0)  # another process has replaced it
+            except LabelFileError as error:
+                path.replace(aside)
+                said = str(error).removesuffix(ADVICE)
+                log.warning("%sIt is moved to %s, and its labels are solved again.", said, aside.name)
+        return 0
+
+    def _verified(self, shard: int, game: Game, x0: Tensor | None) -> int:
+        if not self.path(shard).exists():
+            return 0
+        labels = self.read_shard(shard)
+        if reason := flaw(labels, game):
+            raise LabelFileError(f"{self.path(shard)} holds no labels of this game: {reason}. {ADVICE}")
+        if x0 is not None:
+            asked = (labels.status == Status.CONVERGED) & (labels.start < len(x0))
+            apart = (labels.x[asked, 0] - x0[labels.start[asked]]) / game.state_box.width.cpu()
+            if bool((apart.abs() > 1e-6).any()):
+                raise LabelFileError(f"{self.path(shard)} holds other start states than were asked for. {ADVICE}")
+        return labels.starts
 
     def read(self, starts: int) -> Extremal:
         """The labels of the first start states of the set.
@@ -90,8 +142,8 @@ class LabelSet:
                 raise LabelFileError(f"{self.path(shard)} shrank from {have} to {now} start states. Run again.")
             if now >= have + labels.starts:
                 return
-            new = of_starts(labels, now - have)
-            write_labels(self.path(shard), join([self.read_shard(shard), new]) if now else new, self.provenance)
+            new, made = of_starts(labels, now - have), {**self.provenance, "shard": shard}
+            write_labels(self.path(shard), join([self.read_shard(shard), new]) if now else new, made)
 
     def write_manifest(self) -> None:
         """Write down which shards there are, with their checksums and how far their labels can be trusted."""
@@ -112,8 +164,7 @@ class LabelSet:
                 "shards": shards,
                 "summary": summary(join(found)),
             }
-            text = json.dumps(content, indent=1, sort_keys=True) + "\n"
-            replace_whole(self.folder / MANIFEST, lambda draft: draft.write_text(text))
+            replace_whole(self.folder / MANIFEST, lambda draft: draft.write_text(_signed(content)))
 
     def _shards(self) -> list[dict[str, Any]]:
         paths = sorted(self.folder.glob("shard-*.safetensors"))
@@ -124,10 +175,19 @@ class LabelSet:
         return [path for kind in (".shard-*.*", f".{MANIFEST}.*", ".tmp*") for path in sorted(self.folder.glob(kind))]
 
     def _listed(self) -> Any:
+        """Shards that the manifest lists; None without one. A damaged one, or one without a checksum, is said."""
+        path = self.folder / MANIFEST
         try:
-            return json.loads((self.folder / MANIFEST).read_text())["shards"]
-        except (OSError, ValueError, KeyError, TypeError):
+            text = path.read_text()
+            content = json.loads(text)
+            if _signed(content) == text:
+                return content["shards"]
+        except FileNotFoundError:
             return None
+        except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
+            pass
+        log.warning("%s is damaged, or older than its checksum: it is written again.", path)
+        return None
 
     def check_writable(self) -> None:
         """Raise OSError, with advice, where the folder cannot be written to."""
@@ -150,6 +210,13 @@ class LabelSet:
 
     def _lock(self) -> AbstractContextManager[None]:
         return locked(self.folder / ".lock")
+
+
+def _signed(content: Mapping[str, Any]) -> str:
+    """The text of a manifest with a checksum of its content; one that has a checksum already gets it anew."""
+    bare = {name: entry for name, entry in content.items() if name != "sha256"}
+    digest = hashlib.sha256(json.dumps(bare, sort_keys=True).encode()).hexdigest()
+    return json.dumps({**bare, "sha256": digest}, indent=1, sort_keys=True) + "\n"
 
 
 def _number(name: str) -> int:

@@ -16,6 +16,7 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
+from hno.data.soundness import flaw
 from hno.types import Extremal
 
 FORMAT = 2
@@ -42,7 +43,12 @@ def write_labels(path: Path, labels: Extremal, provenance: Mapping[str, Any]) ->
         path: where; an existing file is replaced only by a complete one.
         labels: extremals of one game.
         provenance: how they were made, JSON content.
+
+    Raises:
+        LabelFileError: labels that `read_labels` would refuse.
     """
+    if reason := flaw(labels):
+        raise LabelFileError(f"{path} is not written, since these are no labels: {reason}.")
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in labels._asdict().items()}
     header = {"format": FORMAT, "sha256": _digest(tensors), "starts": labels.starts, "provenance": dict(provenance)}
     text = canonical_json(header)
@@ -86,26 +92,36 @@ def read_labels(path: Path) -> tuple[Extremal, dict[str, Any]]:
         The extremals and their provenance.
 
     Raises:
-        LabelFileError: not a label file, another format, or its content does not match its checksum.
+        LabelFileError: not a label file, another format, its content does not match its checksum, or is no sound
+            labels (`hno.data.soundness`).
     """
     try:
         with safetensors.safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
     except (safetensors.SafetensorError, OSError) as error:
-        raise LabelFileError(f"{path} cannot be read as a label file ({error}). {_advice(error)}") from error
+        raise _unreadable(path, error) from error
     try:
         header = json.loads(metadata[KEY])
-        found = header["format"], header["sha256"], header["provenance"]
-    except (KeyError, ValueError, TypeError) as error:
-        raise LabelFileError(f"{path} is a safetensors file without hno's metadata. {_ADVICE}") from error
+        found = header["format"], header["sha256"], dict(header["provenance"])
+    except (KeyError, ValueError, TypeError, RecursionError) as error:
+        raise LabelFileError(f"{path} is a safetensors file without hno's metadata. {ADVICE}") from error
     if found[0] == FORMAT and (missing := sorted(set(Extremal._fields) ^ (set(tensors) | ADDED))):
-        raise LabelFileError(f"{path} has other columns than labels of this version: {', '.join(missing)}. {_ADVICE}")
+        raise LabelFileError(f"{path} has other columns than labels of this version: {', '.join(missing)}. {ADVICE}")
     if found[0] != FORMAT:
-        raise LabelFileError(f"{path} has format {found[0]}, expected {FORMAT}. {_ADVICE}")
+        raise LabelFileError(f"{path} has format {found[0]}, expected {FORMAT}. {ADVICE}")
     if found[1] != _digest(tensors):
-        raise LabelFileError(f"{path} is damaged: its content does not match its checksum. {_ADVICE}")
-    return Extremal(**{**_without_potential(tensors), **tensors}), found[2]
+        raise LabelFileError(f"{path} is damaged: its content does not match its checksum. {ADVICE}")
+    try:
+        labels = Extremal(**{**_without_potential(tensors), **tensors})
+        reason = flaw(labels)
+    except (IndexError, RuntimeError, TypeError) as error:
+        reason = f"columns that do not fit each other ({error})"
+    if reason is None and header.get("starts", labels.starts) != labels.starts:
+        reason = f"{labels.starts} start states, its header says {header['starts']}"
+    if reason is not None:
+        raise LabelFileError(f"{path} holds no sound labels: {reason}. {ADVICE}")
+    return labels, found[2]
 
 
 def _without_potential(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -126,8 +142,8 @@ def start_count(path: Path) -> int:
         with safetensors.safe_open(path, framework="pt") as file:
             header = json.loads((file.metadata() or {}).get(KEY, "{}"))
             return int(header.get("starts", file.get_slice("status").get_shape()[0]))
-    except (safetensors.SafetensorError, OSError, ValueError, TypeError) as error:
-        raise LabelFileError(f"{path} cannot be read as a label file ({error}). {_advice(error)}") from error
+    except _UNREADABLE as error:
+        raise _unreadable(path, error) from error
 
 
 def checksum(path: Path) -> str:
@@ -139,17 +155,26 @@ def checksum(path: Path) -> str:
     try:
         with safetensors.safe_open(path, framework="pt") as file:
             return str(json.loads((file.metadata() or {})[KEY])["sha256"])
-    except (safetensors.SafetensorError, OSError, KeyError, ValueError, TypeError) as error:
-        raise LabelFileError(f"{path} carries no checksum of hno's ({error!r}). {_ADVICE}") from error
+    except _UNREADABLE as error:
+        raise LabelFileError(f"{path} carries no checksum of hno's ({error!r}). {ADVICE}") from error
 
 
-_ADVICE = "Move it away and run again; the labels are then solved anew."
+_UNREADABLE = (
+    safetensors.SafetensorError, ArithmeticError, AttributeError, LookupError, OSError, RecursionError, TypeError,
+    ValueError,
+)  # fmt: skip
+"""What reading the header of a damaged or foreign file raises."""
+ADVICE = "Move it away and run again; the labels are then solved anew."
+"""What to do about a damaged file."""
 
 
-def _advice(error: Exception) -> str:
-    """What to do about a file that cannot be opened: safetensors map files into memory, which not every disk can."""
-    unmapped = getattr(error, "errno", None) == errno.ENODEV or "os error 19" in str(error)
-    return "Its disk cannot map files into memory: choose another folder with $HNO_CACHE." if unmapped else _ADVICE
+def _unreadable(path: Path, error: Exception) -> Exception:
+    """What a file that cannot be opened means; the fault of a disk that cannot map files into memory is no damage."""
+    if getattr(error, "errno", None) == errno.ENODEV or "os error 19" in str(error):
+        return OSError(f"{path}: its disk cannot map files into memory. Choose another folder with $HNO_CACHE.")
+    if isinstance(error, PermissionError):
+        return OSError(f"{path} may not be read ({error}). Choose another folder with $HNO_CACHE.")
+    return LabelFileError(f"{path} cannot be read as a label file ({error}). {ADVICE}")
 
 
 def _digest(tensors: Mapping[str, Tensor]) -> str:

@@ -94,8 +94,8 @@ class CollisionTable(ModelSection):
     heading = "Collisions by type"
     note = (
         "safe: starts whose equilibrium keeps the clearance; distance: smallest, 5 % quantile and median; excess cost: "
-        "above the equilibrium's joint cost, median; saturated: controls on a bound; errors: of values and costates "
-        "along labels; apart: unsolved / inevitable / marginal starts"
+        "above the equilibrium's joint cost, median; saturated: controls on a bound; outside: steps outside the PDE "
+        "box; errors: of values and costates along labels; apart: unsolved / inevitable / marginal starts"
     )
     columns = (
         Column("theta", "theta", format=text.types),
@@ -105,6 +105,7 @@ class CollisionTable(ModelSection):
         Column("distances", "distance", "m", text.numbers),
         Column("excess", "excess cost", format=text.cost),
         Column("saturated", "saturated", format=lambda share: text.percent(share, 1)),
+        Column("outside", "outside", format=lambda share: text.percent(share, 1)),
         Column("errors", "errors", format=lambda errors: ", ".join(text.percent(error, 1) for error in errors)),
         Column("apart", "apart", format=lambda counts: " / ".join(map(text.whole, counts))),
     )
@@ -122,6 +123,7 @@ class CollisionTable(ModelSection):
                 "safe": (row["safe_starts"], row["starts"]),
                 "distances": row["distance_quantiles"] and row["distance_quantiles"][::2],
                 "excess": (row["median_excess_cost"], row["median_label_cost"]),
+                "outside": row.get("outside"),  # results that are older do not say it
                 "errors": (row["value_error"], row["costate_error"]),
                 "apart": (row["unsolved"], row["inevitable"], row["marginal"]),
             }
@@ -137,6 +139,11 @@ class CollisionTable(ModelSection):
             f"{keeps}; {row['unsolved']} unsolved, {row['inevitable']} inevitable, {row['marginal']} marginal."
             for row in content
             if row["rate"] is None
+        ]
+        said += [
+            f"{text.counted(row['lost'], 'episode')} at {text.at(row['theta'])} did not stay finite: a collision each."
+            for row in content
+            if row.get("lost")
         ]
         outside = [text.at(row["theta"]) for row in content if row["extrapolated"]]
         if outside:

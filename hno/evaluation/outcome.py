@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from hno.control.questions import outside
 from hno.data.certificates import inevitable, marginal, safe
 from hno.evaluation.metrics import clopper_pearson, quantiles, saturated_share
 from hno.games import Game
@@ -57,6 +58,10 @@ class Outcome(NamedTuple):
     """Median of the label's joint cost."""
     saturated: float | None
     """Share of controls on a bound of their box, over steps, players and controls."""
+    outside: float | None = None
+    """Share of steps at which a player is outside the PDE box, where nothing was learned."""
+    lost: int = 0
+    """Episodes that do not stay finite; they count as collisions."""
 
 
 def outcome(game: Game, labels: Extremal, played: Trajectory, clearance: float) -> Outcome:
@@ -85,6 +90,8 @@ def outcome(game: Game, labels: Extremal, played: Trajectory, clearance: float) 
         median_excess_costs=_finite(quantiles(own, (0.5,))[0]),
         median_label_cost=_finite(quantiles(labels.cost[counted], (0.5,))[0]),
         saturated=saturated_share(played.u[counted], game.control_box),
+        outside=float(outside(game, played.x[counted, :-1]).float().mean()) if count else None,
+        lost=int((played.lost & counted).sum()),
     )
 
 

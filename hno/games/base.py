@@ -23,7 +23,7 @@ REQUIRED = ("horizon", "state_box", "initial_box", "control_box", "type_box")
 
 
 class ExtrapolationWarning(UserWarning):
-    """Player types outside the range that a game is made for."""
+    """Player types or states outside the range that a game is made for."""
 
 
 class Game(FinalMethods, nn.Module, abc.ABC):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -20,6 +20,45 @@ functions: Registry[Any] = Registry("function", "hno.operators")
 
 FieldFunction = Callable[[Points, Types | None], Field | PotentialField]
 """As `ValueOperator.field`."""
+
+
+class _Refused(torch.autograd.Function):
+    """0, whose derivatives are refused."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(*points: Tensor) -> Tensor:
+        return points[0].new_zeros(())
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: Any, output: Any) -> None:
+        pass
+
+    @staticmethod
+    def backward(ctx: Any, *cotangents: Tensor) -> tuple[Tensor, ...]:
+        raise RuntimeError(_REFUSAL)
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Tensor) -> Tensor:
+        raise RuntimeError(_REFUSAL)
+
+
+_REFUSAL = (
+    "A field is not differentiable in its points (tau, x, theta). Its derivatives are its entries `costate` and "
+    "`dvalue_dtau`; what autograd and torch.func take is `operator.value`, or `policy.answer` of one state."
+)
+
+F = TypeVar("F", Field, PotentialField)
+
+
+def at_fixed_points(field: F, points: Points) -> F:
+    """The field, of which any derivative in the points, by reverse or forward mode, is a RuntimeError.
+
+    Networks see the points detached: without this a derivative would be finite, and that of the other parts alone.
+    """
+    zero: Tensor = _Refused.apply(*points)  # type: ignore[no-untyped-call]  # torch does not annotate it
+    return type(field)(*(part + zero for part in field)) if zero.requires_grad else field
 
 
 class ValueOperator(nn.Module, abc.ABC):
@@ -53,7 +92,8 @@ class ValueOperator(nn.Module, abc.ABC):
     def field(self, points: Points, types: Types | None = None) -> Field | PotentialField:
         """Value, time derivative and every costate, of all players at once, or of the potential.
 
-        With gradients enabled the result is differentiable in the parameters, but not in the points: see `value`.
+        With gradients enabled the result is differentiable in the parameters. In the points it is not, which
+        `at_fixed_points` makes an error: see `value`.
 
         Args:
             points: where, physical units.

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.func import jacrev
 
 from hno.games import Game
-from hno.operators.base import FieldFunction, ValueOperator, functions
+from hno.operators.base import FieldFunction, ValueOperator, at_fixed_points, functions
 from hno.operators.deeponet import DeepONet
 from hno.operators.inputs import Encoding, distinct_types
 from hno.operators.network import Inputs, Network
@@ -101,16 +101,17 @@ class GradientOperator(ValueOperator):
         tau, x, theta = points
         y = self.encoding(tau, x, theta).flatten(0, -2)
         raw, gradient = network.value_gradient(y, *self._branch(types or distinct_types(theta)))
-        gradient = gradient.view(*theta.shape, -1)
+        gradient = gradient.view(*theta.shape, gradient.shape[-1])
         value, slope = raw.view_as(theta) * self.value_scale, self.encoding.time_slope(gradient) * self.value_scale
         costate = self.encoding.state_slope(gradient, x, self.value_scale)
         if not self.meets_terminal:
-            return Field(value, slope, costate)
+            return at_fixed_points(Field(value, slope, costate), points)
         share = (tau / self.game.horizon).unsqueeze(-1)
         slope = value / self.game.horizon + share * slope
         with torch.inference_mode(mode=False):
             end = self.game.terminal_value(x), terminal_costate(self.game, x.clone())
-        return Field(end[0] + share * value, slope, end[1] + share[..., None, None] * costate)
+        found = Field(end[0] + share * value, slope, end[1] + share[..., None, None] * costate)
+        return at_fixed_points(found, points)
 
     def _branch(self, types: Types) -> tuple[Tensor, Tensor]:
         """Distinct branch inputs (C P, S), and which of them each row of the trunk takes, (B P,)."""

@@ -71,7 +71,7 @@ class Network(nn.Module, abc.ABC):
 
         By autograd; a network that knows a faster way overrides it. Arguments as in `forward`.
         """
-        training = torch.is_grad_enabled()
+        training = torch.is_grad_enabled() and any(weight.requires_grad for weight in self.parameters())
         with torch.inference_mode(False), torch.enable_grad():
             point = y.detach().clone().requires_grad_()
             value = self(point, sensors.clone(), which.clone())

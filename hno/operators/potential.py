@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.func import jacrev
 
 from hno.games import Game
-from hno.operators.base import ValueOperator, functions
+from hno.operators.base import ValueOperator, at_fixed_points, functions
 from hno.operators.deeponet import DeepONet
 from hno.operators.inputs import JointEncoding, distinct_types
 from hno.operators.network import Inputs, Network
@@ -115,7 +115,8 @@ class PotentialOperator(ValueOperator):
                 (push,) = torch.autograd.grad(end.sum(), at)
             value = end.detach() + share * value
             costate = push.unsqueeze(-3) + share[..., None, None, None] * costate
-        return PotentialField(value.unsqueeze(-1), slope.unsqueeze(-1), costate, _chosen(players, branch), branches)
+        found = PotentialField(value.unsqueeze(-1), slope.unsqueeze(-1), costate, _chosen(players, branch), branches)
+        return at_fixed_points(found, points)
 
     def _heads(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
         """Raw network outputs, (B, K (1 + P)), by a pure function."""

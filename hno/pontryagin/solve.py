@@ -20,7 +20,7 @@ from hno.pontryagin.saturation import nodes_at_kinks
 from hno.pontryagin.starts import Search, Starts, cheapest, find_starts
 from hno.pontryagin.sweep import costates, values
 from hno.pontryagin.threads import torch_threads
-from hno.types import Extremal, Status, join
+from hno.types import Extremal, Numbers, Status, join, tensor_of
 
 
 class Solver(NamedTuple):
@@ -38,8 +38,8 @@ class Solver(NamedTuple):
 
 def solve(
     game: Game,
-    x0: Tensor,
-    theta: Tensor,
+    x0: Numbers,
+    theta: Numbers,
     settings: Solver = Solver(),
     threads: int = 1,
     *,
@@ -62,6 +62,7 @@ def solve(
     Raises:
         ValueError: wrong shapes or entries that are not finite, or a game that says wrongly that it has a potential.
     """
+    x0, theta = tensor_of("x0", x0), tensor_of("theta", theta)
     _check(game, x0, theta)
     with (
         torch_threads(threads),
@@ -240,12 +241,14 @@ def _describe(game: Game, found: OnMesh, settings: Solver) -> Extremal:
     clearance = -game.constraint(everywhere, at.theta.unsqueeze(1).expand(everywhere.shape[:-1])).amax((1, 2, 3))
     t = label_times(game, dtype=x.dtype, device=x.device)
     drift = reintegration_error(game, at)
-    astray = (status == Status.CONVERGED) & (drift > settings.reintegration)
+    status = status.masked_fill((status == Status.CONVERGED) & (drift > settings.reintegration), Status.INACCURATE)
     rows = torch.arange(len(x), device=x.device).unsqueeze(-1)
     nodes = label_places(at.t, t)
     x, costate, u, value, potential = (part[rows, nodes] for part in (x, costate, u, value, potential))
+    parts = x, costate, u, value, clearance, drift, *((potential,) if game.potential else ())
+    finite = torch.stack([part.reshape(len(x), -1).isfinite().all(-1) for part in parts]).all(0)
     return Extremal(
-        status=status.masked_fill(astray, Status.INACCURATE),
+        status=status.masked_fill((status == Status.CONVERGED) & ~finite, Status.NOT_FINITE),
         residual=residual,
         t=t,
         x=x,

@@ -58,6 +58,8 @@ def load(root: Path) -> Sweep:
             runs += _runs(folder, name)
         except ValueError as error:
             skipped.append(Skipped(name, str(error)))
+        except RecursionError:
+            skipped.append(Skipped(name, f"{RESULTS} is nested too deeply to be hno's"))
     if not runs:
         found = "; ".join(f"{entry.name}: {entry.reason}" for entry in skipped[:3]) or f"no {RESULTS} in it or below"
         raise NoRunsError(f"{root} holds no run ({found}). Runs are written by train.py and evaluate.py.")

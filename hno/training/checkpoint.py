@@ -17,12 +17,14 @@ from torch import Tensor, nn
 from torch.nn.modules.module import register_module_parameter_registration_hook
 
 from hno.control.policy import Feedback
+from hno.control.questions import X
 from hno.games import Game, games, make
 from hno.operators import Architecture, ValueOperator, make_operator
 from hno.pontryagin.threads import torch_threads
 from hno.registry import UnknownNameError
 from hno.training.saving import BEST, LAST, PHYSICS, PREVIOUS, UNFIT, is_sound, leaves, not_finite, read_content, reason
 from hno.training.saving import CheckpointError as CheckpointError
+from hno.types import Numbers
 
 log = logging.getLogger(__name__)
 
@@ -338,17 +340,17 @@ class LearnedPolicy(Feedback):
         super().__init__(operator)
         self.architecture, self.provenance, self.threads = architecture, provenance, threads
 
-    def act(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
+    def act(self, tau: Numbers, x: X, theta: Numbers) -> X:
         """As `Feedback.act`, on `threads` threads."""
         with torch_threads(self.threads):
             return super().act(tau, x, theta)
 
-    def value(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
+    def value(self, tau: Numbers, x: X, theta: Numbers) -> X:
         """As `Feedback.value`, on `threads` threads."""
         with torch_threads(self.threads):
             return super().value(tau, x, theta)
 
-    def costate(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
+    def costate(self, tau: Numbers, x: X, theta: Numbers) -> X:
         """As `Feedback.costate`, on `threads` threads."""
         with torch_threads(self.threads):
             return super().costate(tau, x, theta)

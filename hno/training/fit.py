@@ -31,6 +31,9 @@ from hno.types import Extremal
 
 log = logging.getLogger(__name__)
 
+PRECISIONS = ("32-true", "32")
+"""Precisions of Lightning in which a training is sound. The others move the game, its simulation and the scales to 16
+or 64 bits, or compute residuals in 16; the step gains nothing by them, since derivatives are taken in 32 anyway."""
 LONG = 20_000
 """Steps from which on compiling pays: it takes some ten seconds and saves about a millisecond a step."""
 
@@ -52,6 +55,7 @@ class Settings:
     devices: int | str | list[int] = 1
     """One device: 1, or its number in a list."""
     precision: Any = "32-true"
+    """One of `PRECISIONS`."""
     gradient_clip_val: float | None = None
     polish: int = 0
     """Iterations of L-BFGS on all labelled rows after the last step."""
@@ -59,6 +63,14 @@ class Settings:
     """Labels that are added while training."""
     compile: bool = True
     """`torch.compile` in runs of at least `LONG` steps."""
+
+    def __post_init__(self) -> None:
+        """Refuse, with a ValueError, a precision in which simulation and residuals would be wrong."""
+        if str(self.precision) not in PRECISIONS:
+            raise ValueError(
+                f"trainer.precision must be {PRECISIONS[0]}; got {self.precision!r}. Others would compute residuals or "
+                "move the game and its simulation in 16 or 64 bits."
+            )
 
 
 _LEARNED = {False: "the players' values", True: "a potential"}

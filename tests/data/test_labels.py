@@ -10,7 +10,6 @@ from torch import Tensor
 from hno.data import labels as label_data
 from hno.data import shards
 from hno.data.labels import Progress, Request, default_cache, label_set, labels_for, start_states
-from hno.data.store import LabelFileError
 from hno.games import Game, make
 from hno.pontryagin.solve import Solver
 from hno.types import Extremal, Status
@@ -204,15 +203,14 @@ def test_unwritable_folder_is_refused_before_solving(calls: list[tuple[float, ..
     assert not calls
 
 
-def test_damaged_file_is_named_and_kept_before_solving(tmp_path: Path, calls: list[tuple[float, ...]]) -> None:
-    game = make("narrow_road")
-    labels_for(game, [REQUEST], tmp_path, workers=1)
+def test_a_damaged_file_is_solved_again_and_no_other(tmp_path: Path, calls: list[tuple[float, ...]]) -> None:
+    game, other = make("narrow_road"), REQUEST._replace(theta=(2.0, 2.0))
+    labels_for(game, [REQUEST, other], tmp_path, workers=1)
     path = label_set(game, REQUEST, tmp_path).path(0)
     path.write_bytes(path.read_bytes()[:-5])
     calls.clear()
-    with pytest.raises(LabelFileError, match=path.name):
-        labels_for(game, [REQUEST._replace(theta=(2.0, 2.0)), REQUEST], tmp_path, workers=1)
-    assert not calls
+    labels_for(game, [other, REQUEST], tmp_path, workers=1)
+    assert calls == [REQUEST.theta]
 
 
 def test_labels_are_equal_bit_for_bit_however_they_are_split(

@@ -146,17 +146,29 @@ def test_rows_are_not_added_behind_a_gap(fill: Fill) -> None:
 
 @pytest.mark.parametrize("shard", [0, 1, 2])
 @pytest.mark.parametrize("damage", ["flipped", "truncated", "empty"])
-def test_a_damaged_shard_is_named_and_kept(fill: Fill, asked: Asked, shard: int, damage: str) -> None:
+def test_a_damaged_shard_is_named_moved_aside_and_solved_again(
+    fill: Fill, asked: Asked, shard: int, damage: str, caplog: pytest.LogCaptureFixture
+) -> None:
     labels = fill()
-    content = bytearray(labels.path(shard).read_bytes())
+    before, path = files(labels), labels.path(shard)
+    content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 1
-    labels.path(shard).write_bytes({"flipped": content, "truncated": content[:-100], "empty": b""}[damage])
-    before = files(labels)
+    path.write_bytes({"flipped": content, "truncated": content[:-100], "empty": b""}[damage])
+    damaged = path.read_bytes()
     asked.clear()
-    for starts in (300, 1000):
-        with pytest.raises(LabelFileError, match=rf"{labels.path(shard)} .*Move it away"):
-            fill(starts)
-    assert asked.total() == 0
+    fill()
+    assert asked.total() == min(SHARD, 300 - shard * SHARD)
+    assert files(labels) == before | {f"{path.name}.damaged": damaged}
+    assert f"It is moved to {path.name}.damaged, and its labels are solved again." in caplog.text
+
+
+def test_a_damaged_shard_that_cannot_be_moved_is_an_error(fill: Fill, monkeypatch: pytest.MonkeyPatch) -> None:
+    labels = fill()
+    labels.path(1).write_bytes(labels.path(1).read_bytes()[:-100])
+    before = files(labels)
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    with pytest.raises(LabelFileError, match=rf"{labels.path(1)} .*Move it away"):
+        fill()
     assert files(labels) == before
 
 
@@ -169,15 +181,16 @@ def test_a_damaged_shard_that_was_moved_away_is_solved_again(fill: Fill, tmp_pat
     assert files(labels) == before
 
 
-def test_a_shard_of_other_settings_is_refused(fill: Fill, tmp_path: Path) -> None:
+def test_a_shard_of_other_settings_is_moved_aside(fill: Fill, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     labels = fill()
     other = REQUEST._replace(seed=1)
     labels_for(make("narrow_road"), [other], tmp_path / "other", workers=1)
-    shutil.copy(label_set(make("narrow_road"), other, tmp_path / "other").path(1), labels.path(1))
     before = files(labels)
-    with pytest.raises(LabelFileError, match=r"shard-00001.* made by other settings"):
-        fill()
-    assert files(labels) == before
+    shutil.copy(label_set(make("narrow_road"), other, tmp_path / "other").path(1), labels.path(1))
+    foreign = labels.path(1).read_bytes()
+    fill()
+    assert files(labels) == before | {f"{labels.path(1).name}.damaged": foreign}
+    assert "shard-00001.safetensors was made by other settings" in caplog.text
 
 
 def test_manifest_says_what_is_in_the_shards(fill: Fill) -> None:
