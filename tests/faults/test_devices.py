@@ -36,7 +36,7 @@ def test_one_device_is_taken(devices: int | str, tmp_path: Path) -> None:
         ("trainer.devices=1.5", "trainer.devices"),
         ("trainer.devices=[0]", "trainer.devices"),
         ("trainer.accelerator=abacus", "abacus"),
-        ("trainer.precision=8", "Precision 8"),
+        ("trainer.precision=8", "trainer.precision"),
         ("trainer.precision=transformer-engine", "trainer.precision"),
     ],
 )
