@@ -146,7 +146,7 @@ def test_a_misspelt_section_of_a_games_file_is_an_error(
     file.write_text(head + "evaluation: {starts: 3}\n")
     assert main(given) == 0
     file.write_text(head + "evaluatoin: {starts: 3}\n")
-    assert main(given) == 1
+    assert main(given) == 2
     assert "evaluatoin does not exist" in capsys.readouterr().err
 
 

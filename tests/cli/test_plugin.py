@@ -234,7 +234,7 @@ def test_a_part_that_cannot_be_built_fails_its_job_alone(
     sweep = f"hydra.sweep.dir={tmp_path}/sweep"
     run = command("train", "-m", sweep, *SMOKE, "network=shallow,deeponet")
     assert run.code == 1
-    assert "Job 0 failed: a mistake of its author" in run.text
+    assert "Job 0 failed: TypeError: a mistake of its author" in run.text
     assert "#1" in run.text
 
 

@@ -92,7 +92,7 @@ def test_disabled_wandb_leaves_nothing(command: Command) -> None:
 @pytest.mark.usefixtures("no_labels")
 def test_unknown_mode(command: Command) -> None:
     run = command("train", *SMOKE, "logger=wandb", "logger.mode=onlin")
-    assert run.code == 1
+    assert run.code == 2
     assert "logger.mode must be 'auto', 'disabled', 'offline' or 'online'; got 'onlin'" in run.text
 
 
