@@ -222,7 +222,7 @@ version = "0.3"
 py-modules = ["menagerie"]
 """
 MENAGERIE = """
-def {name}():
+class {name}(pkgutil.resolve_name({base!r})):
     "One of another package."
 """
 
@@ -236,8 +236,9 @@ def test_every_group_takes_an_installed_package(tmp_path):
         for kind, registry in REGISTRIES.items()
     ]
     (source / "pyproject.toml").write_text(PROJECT + "\n".join(points), encoding="utf-8")
-    classes = [MENAGERIE.format(name=kind.title()) for kind in REGISTRIES]
-    (source / "menagerie.py").write_text("\n".join(classes), encoding="utf-8")
+    bases = {kind: registry().base or "builtins:object" for kind, registry in REGISTRIES.items()}
+    classes = [MENAGERIE.format(name=kind.title(), base=base) for kind, base in bases.items()]
+    (source / "menagerie.py").write_text("\n".join(["import pkgutil", *classes]), encoding="utf-8")
     pip = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--no-index", "--no-build-isolation"]
     subprocess.run([*pip, "--target", site, source], check=True, capture_output=True, text=True)
     path = os.pathsep.join([str(site), str(Path(hno.__file__).parent.parent)])

@@ -159,6 +159,16 @@ def test_quantiles_saturation_and_own_costs_are_of_safe_starts() -> None:
     assert row.outcome.median_excess_cost == pytest.approx(excess.sum(-1).median().item())
 
 
+def test_steps_outside_the_pde_box_are_counted() -> None:
+    """At 4 m/s for 1 s, from 0 and with one step in ten beyond the box."""
+    game, found = Walkers(), labelled([0.9], [0.5])
+    game.state_box.hi[..., 0] = 3.5
+    (row,) = played_table(game, straight, [found], seen=[], dt=0.1)
+    assert row.outcome.outside == pytest.approx(0.1)
+    (row,) = played_table(Walkers(), straight, [found], seen=[], dt=0.1)
+    assert row.outcome.outside == 0
+
+
 def test_errors_are_weighted_over_the_nodes_of_converged_labels() -> None:
     """As torchmetrics' WeightedMeanAbsolutePercentageError: sum of errors over sum of labels."""
     found = labelled([0.9, 0.8, 0.7], [0.5, -0.2, 0.5], [GOOD, GOOD, BAD])

@@ -13,6 +13,7 @@ from types import SimpleNamespace
 
 import pytest
 import safetensors
+import torch
 
 from hno.cli.results import Results
 from hno.data import folders
@@ -20,6 +21,7 @@ from hno.data.labels import Request, label_bytes, label_set, labels_for
 from hno.data.store import read_labels, start_count, write_labels
 from hno.games import make
 from hno.training.fit import _check_room
+from hno.training.saving import LAST, read_content, write_checkpoint
 from tests.cli import conftest as cli
 from tests.cli.conftest import Command
 from tests.data import conftest
@@ -97,6 +99,17 @@ def test_results_that_do_not_fit_leave_those_that_were_there(place: Path) -> Non
         results.update(table=[0.5] * 10_000)
     assert files(place) == before
     assert json.loads((place / "results.json").read_text())["status"] == "running"
+
+
+def test_a_checkpoint_that_does_not_fit_leaves_those_that_were_there(place: Path) -> None:
+    path = place / LAST
+    write_checkpoint({"step": 1}, path)
+    before = files(place)
+    fill(place)
+    with pytest.raises(OSError, match=r"last\.ckpt could not be written .*what was there before is whole"):
+        write_checkpoint({"weights": torch.zeros(10_000)}, path)
+    assert files(place) == before
+    assert read_content(path) == {"step": 1}
 
 
 def test_a_set_that_does_not_fit_keeps_its_shards(place: Path, asked: Asked) -> None:
