@@ -57,6 +57,10 @@ class MLP(nn.Module):
         return hidden, folded[-1]
 
 
+WIDEST, DEEPEST = 4096, 100
+"""Sizes beyond which a net is a slip of the pen, or a file that is to fill the memory."""
+
+
 @final
 @networks.register("deeponet")
 class DeepONet(Network):
@@ -72,13 +76,13 @@ class DeepONet(Network):
         depth: hidden layers.
 
     Raises:
-        ValueError: `width` or `depth` is below 1.
+        ValueError: `width` or `depth` is below 1, or above `WIDEST` or `DEEPEST`.
     """
 
     def __init__(self, inputs: Inputs, activation: Callable[[], Activation], width: int = 64, depth: int = 4) -> None:
-        for name, size in (("width", width), ("depth", depth)):
-            if size < 1:
-                raise ValueError(f"network.{name} must be a whole number of at least 1; got {size!r}.")
+        for name, size, most in (("width", width, WIDEST), ("depth", depth, DEEPEST)):
+            if not 1 <= size <= most:
+                raise ValueError(f"network.{name} must be a whole number from 1 to {most}; got {size!r}.")
         super().__init__()
         self.inputs = inputs
         hidden, several = (width,) * (depth + 1), inputs.others > 1

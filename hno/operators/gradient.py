@@ -19,6 +19,9 @@ from hno.operators.value_gradient import compiled
 from hno.pontryagin.adjoint import terminal_costate
 from hno.types import Field, Points, Types
 
+MOST = 99
+"""Members that an ensemble may have: more are a slip of the pen, or a file that is to fill the memory."""
+
 
 @final
 @functions.register("value")
@@ -34,16 +37,16 @@ class GradientOperator(ValueOperator):
             between them in its own way; the median follows the majority.
 
     Raises:
-        ValueError: `members` is no odd whole number.
+        ValueError: `members` is no odd whole number, or above `MOST`.
     """
 
     def __init__(
         self, game: Game, network: Callable[[Inputs], Network], exact_terminal: bool = True, members: int = 1
     ) -> None:
-        if not (type(members) is int and members > 0 and members % 2):
+        if not (type(members) is int and 0 < members <= MOST and members % 2):
             raise ValueError(
-                "function.members must be an odd whole number, such as 1 or 3, so that there is a median; "
-                f"got {members!r}."
+                "function.members must be an odd whole number, such as 1 or 3, so that there is a median, and at most "
+                f"{MOST}; got {members!r}."
             )
         super().__init__(game)
         self.meets_terminal = exact_terminal

@@ -87,6 +87,8 @@ def _runs(folder: Path, name: str) -> list[Run]:
         raise ValueError(f"no {RESULTS}: the job has only begun, or ended before it could write any")
     content = _json(folder / RESULTS)
     models = content.pop("models", None) or [{}]
+    if not (isinstance(models, list) and all(isinstance(model, dict) for model in models)):
+        raise ValueError(f"{RESULTS} is not hno's: models is no list of objects")
     shared = {key: value for key, value in content.items() if key not in ("episodes", "comparison")}
     names = [name] if len(models) == 1 else [f"{name} [{k}]" for k in range(len(models))]
     return [

@@ -104,6 +104,12 @@ def test_many_configurations_are_valid_or_refused_on_one_screen(capsys: pytest.C
     fuzz(2000, capsys)
 
 
+@pytest.mark.parametrize("word", ["network.depth=5000000000", "network.width=100000", "function.members=1000001"])
+def test_sizes_that_would_fill_the_memory_are_refused(word: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["train", *SMOKE, "function=value", word]) == 2
+    assert f"{word.split('=')[0]} must be" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(("mode", "code"), [("", 0), ("offline", 0), ("nonsense", 2)])
 def test_modes_of_wandb(mode: str, code: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("WANDB_MODE", mode)

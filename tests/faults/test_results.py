@@ -96,6 +96,11 @@ def test_deep_nesting_is_shown_or_refused(tmp_path: Path, depth: int, place: str
     assert sys.getrecursionlimit() == limit
 
 
+@pytest.mark.parametrize("models", [True, [None], "text", {"a": 1}, 3])
+def test_models_that_are_no_list_of_objects_are_refused(tmp_path: Path, models: object) -> None:
+    assert page_of(tmp_path, results() | {"models": models}) is None
+
+
 JSON = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8) | st.sampled_from(SCRIPTS),
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=8), inner, max_size=3),
