@@ -27,11 +27,11 @@ def run(given: Arguments) -> int:
     name, constants, place = given.words[0], _constants(given.overrides), ""
     try:
         game = _class(name)(**constants) if ":" in name else make(name, **constants)
-        place = f" ({inspect.getsourcefile(type(game))})"
+        place = f" It is in {inspect.getsourcefile(type(game))}."
         check_game(game)
     except Exception as error:  # whatever a file of the user's raises
         said = str(error) if isinstance(error, (ContractError, UnknownNameError)) else reason(error)
-        print(f"{name}{place} cannot be used yet: {said}", file=sys.stderr)
+        print(f"{name} cannot be used yet: {said}{place}", file=sys.stderr)
         return 1
     print(
         f"{name} keeps the contract of a game: {game.players} players, {game.state_dim} states and "
