@@ -82,6 +82,7 @@ class TrainerSettings(Settings):
     """How long and on what."""
 
     max_steps: Size
+    schedule_steps: Size | None
     accelerator: Text
     devices: Loose
     precision: Loose
