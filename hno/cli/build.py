@@ -126,7 +126,7 @@ def how_to_train(settings: TrainSettings) -> Settings:
         steps=settings.trainer.max_steps,
         optimizer=settings.optimizer,
         stop_when_safe=settings.validation.stop_when_safe,
-        dt=settings.evaluation.dt,
+        dt=settings.validation.dt,
         adaptive=Adaptive(**settings.data.adaptive.model_dump()),
         **shared,
     )

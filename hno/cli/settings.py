@@ -130,6 +130,8 @@ class ValidationSettings(Settings):
     starts: Size
     stop_when_safe: bool
     seed: Seed
+    clearance: Amount
+    dt: Positive
 
 
 class TrainSettings(Settings):

@@ -117,7 +117,7 @@ def validation_starts(settings: TrainSettings, data: GameData, results: Results)
 
     Of the latter only those that are played first are solved before the training, the others when they are needed.
     """
-    choice, clearance = settings.validation, settings.evaluation.clearance
+    choice, clearance = settings.validation, settings.validation.clearance
     if choice.types is None:
         return safe_sets(data.held_out(), clearance), None
     types = parse_types(data.game, choice.types, key="validation.types")
