@@ -94,6 +94,7 @@ class ClosedLoopValidation(L.Callback):
         self.all: Starts | None = None
         self.later: Later | None = None
         self.best: Score | None = None
+        self.found: Score | None = None
         self.resumes = True
         self.seconds = self.solving = 0.0
 
@@ -123,10 +124,13 @@ class ClosedLoopValidation(L.Callback):
         """Validate where it is time to."""
         assert isinstance(pl_module, TrainingModule)
         due = trainer.global_step % self.every == 0 or trainer.global_step == trainer.max_steps
-        found = self.consider(trainer, pl_module) if due else None
-        if found is not None:
-            pl_module.log_dict({f"closed_loop/{name}": value for name, value in found._asdict().items()})
-            trainer.should_stop |= self.satisfied
+        self.found = self.consider(trainer, pl_module) if due else None
+        trainer.should_stop |= self.satisfied
+
+    def on_validation_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Log what was found, beside the errors on held-out labels."""
+        if self.found is not None:
+            pl_module.log_dict({f"closed_loop/{name}": value for name, value in self.found._asdict().items()})
 
     def consider(self, trainer: L.Trainer, module: TrainingModule) -> Score | None:
         """Play, if there are starts, and write `best.ckpt` if nothing was better so far."""
