@@ -47,5 +47,5 @@ class Logbook(L.Callback):
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Add to it."""
-        self.before, self.began = state_dict["seconds"], time.perf_counter()
-        self.metrics = dict(state_dict["metrics"])
+        self.before, self.began = float(state_dict["seconds"]), time.perf_counter()
+        self.metrics = {str(name): float(value) for name, value in state_dict["metrics"].items()}

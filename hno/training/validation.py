@@ -180,5 +180,5 @@ class ClosedLoopValidation(L.Callback):
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Go on from it, where the checkpoint that it belongs to is there and is to be used (`resumes`)."""
-        self.seconds, self.solving = state_dict["seconds"], state_dict["solving"]
+        self.seconds, self.solving = float(state_dict["seconds"]), float(state_dict["solving"])
         self.best = Score(*state_dict["best"]) if state_dict["best"] and self.resumes and self.path.exists() else None
