@@ -8,6 +8,7 @@ import re
 import shutil
 from collections.abc import Mapping
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 from hno.cli.arguments import FOLDERS, Arguments, as_path, quoted
 from hno.cli.schema import SettingsError
 from hno.cli.settings import TrainSettings
+from hno.data.store import replace_whole
 from hno.report.runs import METRICS, RESULTS
 from hno.training.checkpoint import find_checkpoint, flat, same_run
 from hno.training.saving import BEST, LAST, RESUMED, read_content
@@ -182,12 +184,14 @@ def take_over(place: str | None, folder: Path) -> Path | None:
     """
     before = folder if place is None else run_folder(place)
     resume = None if place is None else newest(before)
-    if resume is None or not same_run(before / BEST, resume):
+    ours = resume is not None and same_run(before / BEST, resume)
+    if not ours:
         (folder / BEST).unlink(missing_ok=True)
     if resume is None or before.resolve() == folder.resolve():
         return resume
     (folder / METRICS).parent.mkdir(exist_ok=True)
-    for old, new in ((resume, LAST), (before / BEST, BEST), (before / METRICS, METRICS)):
+    best = {BEST: before / BEST} if ours else {}
+    for name, old in {str(METRICS): before / METRICS, **best, LAST: resume}.items():  # killed before the last: anew
         if old.exists():
-            shutil.copy2(old, folder / new)
+            replace_whole(folder / name, partial(shutil.copyfile, old))
     return folder / LAST
