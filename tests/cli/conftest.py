@@ -80,16 +80,16 @@ def command(
     """Run a command in this process, as the command line would, but without pictures and pages."""
     monkeypatch.setattr(evaluate, "draw_typical", lambda *arguments: None)
 
-    def run(name: str, *words: str, folder: Path = tmp_path / "run") -> Outcome:
+    def run(name: str, *words: str, folder: Path | None = tmp_path / "run") -> Outcome:
         monkeypatch.setattr(sys, "argv", [name])
         capsys.readouterr()
-        to = [f"hydra.run.dir={folder}"] if name in ("train", "evaluate") else []
+        to = [f"hydra.run.dir={folder}"] if name in ("train", "evaluate") and folder is not None else []
         code: int | str | None
         try:
             code = main([name, *words, *to])
         except SystemExit as stop:  # Lightning's, after an interruption
             code = stop.code
-        return Outcome(int(code or 0), "".join(capsys.readouterr()), folder)
+        return Outcome(int(code or 0), "".join(capsys.readouterr()), folder or tmp_path)
 
     return run
 
