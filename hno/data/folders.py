@@ -17,6 +17,8 @@ import filelock
 
 log = logging.getLogger(__name__)
 
+LOCK = ".lock"
+"""Name of the lock file of a run's folder, which its process holds while it works: the kernel frees it at its end."""
 PATIENCE = 5.0
 """Time after which waiting is announced for the first time, s; each further time it takes twice as long."""
 POLL = 0.5
@@ -81,10 +83,22 @@ class Waiting:
         """Name the lock file and its holder, if it is time to."""
         if time.monotonic() - self.began >= self.patience:
             self.patience *= 2
-            log.warning("Waiting for %s, held by %s.", path, _holder(path))
+            log.warning("Waiting for %s, held by %s.", path, holder(path))
 
 
-def _holder(path: Path) -> str:
+def held(path: Path) -> bool:
+    """Whether some process holds a lock file; also where it cannot be told, for want of locks or permissions."""
+    if not path.exists():
+        return False
+    try:
+        with claimed(path) as ours:
+            return not ours
+    except OSError:
+        return True
+
+
+def holder(path: Path) -> str:
+    """Who holds a lock file."""
     try:
         since = datetime.fromtimestamp(path.stat().st_mtime).astimezone()
         process, host, *_ = path.read_text().splitlines()

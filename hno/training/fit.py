@@ -19,9 +19,11 @@ from hno.data.certificates import safe_sets
 from hno.data.folders import check_room
 from hno.losses import Objective, Scales
 from hno.operators import ValueOperator
+from hno.processes import stop_if_asked, waiting_signals
 from hno.training.adaptive import Adaptive, AdaptiveLabels, Round
 from hno.training.checkpoint import check_training_state, same_run
 from hno.training.divergence import StopOnDivergence
+from hno.training.interruption import SaveOnSignal
 from hno.training.module import TrainingModule
 from hno.training.optimizers import make_optimizer
 from hno.training.polish import polish
@@ -153,7 +155,8 @@ def fit(
     _check_room(folder, operator)
     began = time.perf_counter()
     try:
-        trainer.fit(module, datamodule=data, ckpt_path=resume, weights_only=True)
+        with waiting_signals():
+            trainer.fit(module, datamodule=data, ckpt_path=resume, weights_only=True)
     except UNFIT as error:
         if resume is None or module.began:
             raise
@@ -164,6 +167,7 @@ def fit(
         watch.consider(trainer, module)
     # The callback saves at multiples of `validate_every`, which the last step need not be.
     trainer.save_checkpoint(folder / LAST, weights_only=False)
+    stop_if_asked()
     added = sum(found.seconds for found in adding.done)
     training = time.perf_counter() - began - watch.seconds - added
     seconds = {"training": training, "validation": watch.seconds} | ({"added_labels": added} if adding.done else {})
@@ -206,7 +210,7 @@ def make_trainer(
         num_sanity_val_steps=0,
         log_every_n_steps=max(1, min(50, settings.steps)),
         logger=list(loggers) or False,
-        callbacks=[StopOnDivergence(folder, files), *callbacks, keeping_last],
+        callbacks=[StopOnDivergence(folder, files), SaveOnSignal(folder), *callbacks, keeping_last],
         plugins=[files],
         enable_progress_bar=any(isinstance(callback, ProgressBar) for callback in callbacks),
         enable_model_summary=False,
