@@ -13,7 +13,7 @@ from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
 
-import filelock
+from filelock import BaseFileLock, FileLock, SoftFileLock, Timeout  # now, not while a lock is held
 
 log = logging.getLogger(__name__)
 
@@ -38,10 +38,10 @@ def claimed(path: Path, timeout: float = 0.0) -> Iterator[bool]:
     Raises:
         OSError: the file system has no locks.
     """
-    lock: filelock.BaseFileLock = filelock.FileLock(path)
+    lock: BaseFileLock = FileLock(path)
     try:
         lock.acquire(timeout=timeout)
-    except filelock.Timeout:
+    except Timeout:
         yield False
         return
     except OSError as error:
@@ -51,7 +51,7 @@ def claimed(path: Path, timeout: float = 0.0) -> Iterator[bool]:
             error.errno, f"The file system of {path.parent} has no file locks. Choose another folder with $HNO_CACHE"
         ) from error
     try:
-        if not isinstance(lock, filelock.SoftFileLock):  # which says so itself
+        if not isinstance(lock, SoftFileLock):  # which says so itself
             with suppress(OSError):  # a full disk
                 path.write_text(f"{os.getpid()}\n{platform.node()}\n")
         yield True
