@@ -135,7 +135,7 @@ def test_a_signal_ends_a_sweep_with_its_table(
 ) -> None:
     run = command("train", "-m", *SMOKE, "seed=0,1", f"hydra.sweep.dir={tmp_path}/sweep")
     assert run.code == 143
-    assert "1 job\n" in run.text
+    assert "1 job " in run.text
     assert "Job 0 interrupted: SIGTERM" in run.text
 
 
