@@ -77,10 +77,18 @@ def command(
     clean_globals: None,
     no_pages: None,
 ) -> Command:
-    """Run a command in this process, as the command line would, but without pictures and pages."""
+    """Run a command in this process, as the command line would, but without pictures and pages.
+
+    It gets a folder of its own, but for a run that is resumed: the one before.
+    """
     monkeypatch.setattr(evaluate, "draw_typical", lambda *arguments: None)
 
-    def run(name: str, *words: str, folder: Path = tmp_path / "run") -> Outcome:
+    folders = [tmp_path / "run"]
+
+    def run(name: str, *words: str, folder: Path | None = None) -> Outcome:
+        if folder is None and folders[-1].exists() and not any(word.startswith("resume=") for word in words):
+            folders.append(tmp_path / f"run_{len(folders) + 1}")
+        folder = folder or folders[-1]
         monkeypatch.setattr(sys, "argv", [name])
         capsys.readouterr()
         to = [f"hydra.run.dir={folder}"] if name in ("train", "evaluate") else []

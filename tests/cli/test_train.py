@@ -134,8 +134,8 @@ def test_run_leaves_a_picture_of_an_episode(command: Command, monkeypatch: pytes
     assert (run.folder / "rollout.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_label_sizes_are_the_scales_of_the_network(command: Command, tmp_path: Path) -> None:
-    scaled = command("train", *SMOKE, "trainer.max_steps=1", folder=tmp_path / "scaled")
+def test_label_sizes_are_the_scales_of_the_network(command: Command) -> None:
+    scaled = command("train", *SMOKE, "trainer.max_steps=1")
     assert float(weights(scaled.folder)["operator.value_scale"]) > 1
     physical = command("train", *SMOKE, "trainer.max_steps=1", "loss.scaled=false")
     assert float(weights(physical.folder)["operator.value_scale"]) == 1

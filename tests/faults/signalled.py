@@ -14,7 +14,7 @@ import sys
 import time
 import uuid
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -58,41 +58,53 @@ class Left(NamedTuple):
     seconds: float
     """From the signal to the end."""
     processes: list[int]
-    """Those that are alive half a second later."""
+    """Those that are alive some seconds later."""
+
+
+class Started(NamedTuple):
+    """A command at work."""
+
+    process: subprocess.Popen[bytes]
+    name: str
+    """Which its processes have in their environment."""
+    output: Path
+
+    def until(self, begun: Callable[[], bool]) -> None:
+        """Wait for a part of the work to begin."""
+        while not begun():
+            assert self.process.poll() is None, self.output.read_text()
+            time.sleep(0.02)
+
+    def end(self, number: int) -> Left:
+        """Send a signal and wait for the end."""
+        began = time.monotonic()
+        self.process.send_signal(number)
+        self.process.wait(60)
+        seconds = time.monotonic() - began
+        deadline = time.monotonic() + 3.0
+        while (left := alive(self.name)) and time.monotonic() < deadline:
+            time.sleep(0.1)
+        return Left(self.process.returncode, self.output.read_text(), seconds, left)
 
 
 @contextmanager
-def started(phase: str, mark: Path, cache: Path, *words: str) -> Iterator[subprocess.Popen[str]]:
-    """A command whose phase has begun; whatever is left of it afterwards is killed."""
-    name = uuid.uuid4().hex
-    root = Path(__file__).parents[2]
+def started(phase: str, folder: Path, cache: Path, *words: str) -> Iterator[Started]:
+    """A command, whose phase leaves a file "mark" in a folder; whatever is left of it afterwards is killed."""
+    folder.mkdir(exist_ok=True)
+    root, name, output = Path(__file__).parents[2], uuid.uuid4().hex, folder / "output"
     own = {VARIABLE: name, "HNO_CACHE": str(cache), "OMP_NUM_THREADS": "1", "PYTHONPATH": str(root)}
-    command = subprocess.Popen(
-        [sys.executable, "-m", "tests.faults.signalled", phase, str(mark), *words], env=os.environ | own,
-        cwd=root, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, process_group=0,
-    )  # fmt: skip
+    with output.open("wb") as file:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "tests.faults.signalled", phase, str(folder / "mark"), *words],
+            env=os.environ | own, cwd=root, stdout=file, stderr=subprocess.STDOUT, process_group=0,
+        )  # fmt: skip
     try:
-        while not (any(cache.rglob(".claim-*")) if phase == "labels" else mark.exists()):
-            assert command.poll() is None, command.communicate()[0]
-            time.sleep(0.02)
-        yield command
+        yield Started(process, name, output)
     finally:
-        for process in alive(name):
-            os.kill(process, signal.SIGKILL)
-        command.communicate()
-
-
-def end(command: subprocess.Popen[str], number: int) -> Left:
-    """Send a signal and wait for the end."""
-    name = dict(entry.partition("=")[::2] for entry in Path(f"/proc/{command.pid}/environ").read_text().split("\0"))
-    began = time.monotonic()
-    command.send_signal(number)
-    command.wait(60)
-    seconds = time.monotonic() - began
-    deadline = time.monotonic() + 3.0
-    while (left := alive(name[VARIABLE])) and time.monotonic() < deadline:
-        time.sleep(0.1)
-    return Left(command.returncode, command.stdout.read() if command.stdout and not left else "", seconds, left)
+        for left in alive(name):
+            with suppress(ProcessLookupError):
+                os.kill(left, signal.SIGKILL)
+        process.wait()
 
 
 def alive(name: str) -> list[int]:

@@ -22,7 +22,7 @@ from hno.processes import Interrupted, interruptible, stop_if_asked, waiting_sig
 from hno.training.saving import LAST, read_content
 from tests.cli import conftest
 from tests.cli.conftest import SMOKE, Command, Outcome
-from tests.faults.signalled import Left, end, started
+from tests.faults.signalled import Left, started
 
 clean_globals, command, no_pages = conftest.clean_globals, conftest.command, conftest.no_pages
 random_checkpoint = conftest.random_checkpoint
@@ -145,8 +145,10 @@ def labels(cache: Path) -> tuple[str, ...]:
 
 @pytest.mark.parametrize(("name", "code"), [("SIGINT", 130), ("SIGKILL", -9)])
 def test_no_label_worker_outlives_its_parent(tmp_path: Path, name: str, code: int) -> None:
-    with started("labels", tmp_path / "mark", tmp_path / "cache", *labels(tmp_path / "cache")) as process:
-        left = end(process, getattr(signal, name))
+    cache = tmp_path / "cache"
+    with started("labels", tmp_path, cache, *labels(cache)) as command:
+        command.until(lambda: any(cache.rglob(".claim-*")))
+        left = command.end(getattr(signal, name))
     assert (left.code, left.processes) == (code, [])
     assert "Traceback" not in left.text
     assert name == "SIGKILL" or "Interrupted by SIGINT. Finished shards are kept" in left.text
@@ -172,10 +174,10 @@ LAUNCHERS = {
 def after(name: str, work: str, tmp_path: Path, cache: Path, *further: str) -> tuple[Left, list[Outcome]]:
     """What is left of a command after a signal in its work, and of its runs."""
     phase, words = WORK[work]
-    mark, folder = tmp_path / "mark", tmp_path / "run"
-    own = tmp_path / "labels" if phase == "labels" else cache
-    with started(phase, mark, own, *words, *further, "--to", str(folder)) as process:
-        left = end(process, getattr(signal, name))
+    folder, own = tmp_path / "run", tmp_path / "labels" if phase == "labels" else cache
+    with started(phase, tmp_path, own, *words, *further, "--to", str(folder)) as command:
+        command.until(lambda: (tmp_path / "mark").exists() or (phase == "labels" and any(own.rglob(".claim-*"))))
+        left = command.end(getattr(signal, name))
     runs = [path.parent for path in sorted(folder.rglob("results.json"))]
     return left, [Outcome(left.code, left.text, run) for run in runs]
 
@@ -202,14 +204,11 @@ def test_a_signal_ends_every_sweep(tmp_path: Path, cache: Path, launcher: str, n
     if launcher != "basic":
         pytest.importorskip(f"hydra_plugins.hydra_{launcher}_launcher")
     steps = ("trainer.max_steps=100000", "trainer.compile=false", "trainer.validate_every=100000")
-    words = ("-m", *TRAIN, *steps, "seed=0,1", *LAUNCHERS[launcher], "hydra.sweep.dir=" + str(tmp_path / "run"))
-    with started("sweep", tmp_path / "mark", cache, "train", *words[:1], *words[2:]) as process:
-        runs = tmp_path / "run"
-        many = 1 if launcher == "basic" else 2
-        while len([1 for log in runs.rglob("train.log") if "step 5 of" in log.read_text()]) < many:
-            assert process.poll() is None
-            time.sleep(0.1)
-        left = end(process, getattr(signal, name))
+    runs, many = tmp_path / "run", 1 if launcher == "basic" else 2
+    words = (*TRAIN, *steps, "data.workers=1", "seed=0,1", *LAUNCHERS[launcher], "--to", str(runs))
+    with started("sweep", tmp_path, cache, *words, "-m") as command:
+        command.until(lambda: sum("step 5 of" in log.read_text() for log in runs.rglob("train.log")) == many)
+        left = command.end(getattr(signal, name))
     assert (left.code, left.processes) == (SIGNALS[name], []), left.text
     found = [json.loads(path.read_text()) for path in runs.rglob("results.json")]
     assert [(results["status"], results["reason"]) for results in found] == [("interrupted", name)] * many
