@@ -213,7 +213,7 @@ def test_another_format_is_one_clear_sentence(save: Save, version: int | None) -
     """Format 2 is what the releases before wrote: an operator's own name, options and types."""
     older = {"format": version, "game": "narrow_road", "operator": "hno", "options": {"width": 64}, "seen_types": []}
     path = save(hno=older)
-    assert refused(path) == f"{path} has format {version}, this version of hno reads format 5: train it again."
+    assert refused(path) == f"{path} has format {version}, this version of hno reads format 6: train it again."
     assert "train it again" in refused(save(spec={"format": version}))
 
 
@@ -237,7 +237,7 @@ def test_resuming_asks_for_the_same_game_operator_network_and_origin(make_operat
         (record(game, architecture("sin"), ORIGIN), "'tanh', expected 'sin'"),
         (record(game, architecture(), replace(ORIGIN, method="sno")), "method 'hno', expected 'sno'"),
         (record(game, architecture(), replace(ORIGIN, seed=8)), "seed 7, expected 8"),
-        (record(game, architecture(), replace(ORIGIN, config_hash="another")), "config_hash"),
+        (record(game, architecture(), replace(ORIGIN, training_hash="another")), "training_hash"),
     ):
         with pytest.raises(CheckpointError, match=f"{differs}.*Resume with its own configuration"):
             check_resumable(path, other)
