@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, final
@@ -36,9 +37,14 @@ class CurveLogger(Logger):
         if new := row.keys() - set(self.columns):
             self.columns = sorted([*self.columns, *new])
             self._rewrite([*read_rows(self.path), row])
-        else:
+            return
+        whole = self.path.stat().st_size
+        try:
             with self.path.open("a", newline="") as file:
                 self._writer(file).writerow(row)
+        except OSError:  # a full disk: no half row stays
+            os.truncate(self.path, whole)
+            self._rewrite([*read_rows(self.path), row])  # this does not fit either, and says what to do
 
     def log_hyperparams(self, *params: Any, **named: Any) -> None:
         """They are in results.json."""
