@@ -12,7 +12,7 @@ import hno
 
 ROOT = Path(hno.__file__).parent
 LEVELS = (
-    {"types", "registry"},
+    {"types", "registry", "processes"},
     {"games"},
     {"pontryagin"},
     {"losses", "data"},

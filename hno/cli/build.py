@@ -11,7 +11,7 @@ from omegaconf import DictConfig
 
 from hno.cli.config import read
 from hno.cli.evaluate import check_evaluation, unseen_types
-from hno.cli.logs import check_wandb, quiet_lightning
+from hno.cli.logs import check_wandb
 from hno.cli.resume import check_same_training, newest, own_configuration, run_folder, training_hash
 from hno.cli.settings import TrainSettings
 from hno.data import Collocation, GameData, LabelPlan, make_sampler
@@ -26,6 +26,7 @@ from hno.training.adaptive import Adaptive
 from hno.training.checkpoint import Provenance, check_resumable, record
 from hno.training.fit import Settings, make_trainer
 from hno.training.optimizers import make_optimizer
+from hno.training.quiet import quiet_lightning
 
 
 class Built(NamedTuple):

@@ -13,6 +13,7 @@ from typing import Any
 
 import hno
 from hno.data.store import replace_whole
+from hno.processes import Interrupted
 
 PACKAGES = ("torch", "lightning", "torchmetrics", "hydra-core", "omegaconf", "wandb", "scipy", "safetensors")
 
@@ -70,11 +71,16 @@ class Results:
 
 @contextmanager
 def recorded(results: Results) -> Iterator[None]:
-    """Work whose end is in the results: that it is finished, or why it failed."""
+    """Work whose end is in the results: that it is finished, which signal interrupted it, or why it failed."""
     try:
         yield
+    except Interrupted as stop:
+        results.update(status="interrupted", reason=str(stop))
+        raise
+    except (KeyboardInterrupt, SystemExit):  # Lightning turns the one into the other
+        results.update(status="interrupted", reason="SIGINT")
+        raise
     except BaseException as error:
-        interrupted = isinstance(error, (KeyboardInterrupt, SystemExit))  # Lightning turns the one into the other
-        results.update(status="failed", reason="interrupted" if interrupted else f"{type(error).__name__}: {error}")
+        results.update(status="failed", reason=f"{type(error).__name__}: {error}")
         raise
     results.update(status="finished")

@@ -19,6 +19,7 @@ from hno.data.labels import Report, Request, default_cache, labels_for
 from hno.data.plans import BATCH_SIZES, Collocation, LabelPlan
 from hno.data.sources import Known, Pool, sample_points
 from hno.games import Game
+from hno.processes import stop_if_asked
 from hno.types import (
     Batch,
     Extremal,
@@ -272,6 +273,7 @@ class _Steps(IterableDataset[Batch]):
     def __iter__(self) -> Iterator[Batch]:
         step = self.first
         while True:
+            stop_if_asked()  # the step before is complete, its losses are logged
             yield self.data.batch(step)
             step += 1
 

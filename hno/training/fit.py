@@ -17,13 +17,16 @@ from hno.data.certificates import safe_sets
 from hno.data.folders import check_room
 from hno.losses import Objective, Scales
 from hno.operators import ValueOperator
+from hno.processes import stop_if_asked, waiting_signals
 from hno.training.adaptive import Adaptive, AdaptiveLabels, Round
 from hno.training.checkpoint import check_training_state, same_run
 from hno.training.divergence import StopOnDivergence
+from hno.training.interruption import SaveOnSignal
 from hno.training.logbook import Logbook
 from hno.training.module import TrainingModule
 from hno.training.optimizers import make_optimizer
 from hno.training.polish import Polish
+from hno.training.quiet import quiet_lightning
 from hno.training.saving import BEST, LAST, UNFIT, CheckpointError, CheckpointFiles, read_content, reason, remove_drafts
 from hno.training.validation import ClosedLoopValidation, Later, Score
 from hno.types import Extremal
@@ -99,6 +102,7 @@ class Fitted(NamedTuple):
     this one goes on from too."""
 
 
+@quiet_lightning()
 def fit(
     operator: ValueOperator,
     objective: Objective,
@@ -161,11 +165,13 @@ def fit(
         watch.resumes = same_run(folder / BEST, resume)
     _check_room(folder, operator)
     try:
-        trainer.fit(module, datamodule=data, ckpt_path=resume, weights_only=True)
+        with waiting_signals():
+            trainer.fit(module, datamodule=data, ckpt_path=resume, weights_only=True)
     except UNFIT as error:
         if resume is None or module.began:
             raise
         raise CheckpointError(f"{resume} does not fit this run: {reason(error)}") from error
+    stop_if_asked()
     added = sum(found.seconds for found in adding.done)
     training = logbook.seconds - watch.seconds - added
     seconds = {"training": training, "validation": watch.seconds - watch.solving}
@@ -205,7 +211,7 @@ def make_trainer(
         num_sanity_val_steps=0,
         log_every_n_steps=max(1, min(50, settings.planned)),
         logger=list(loggers) or False,
-        callbacks=[StopOnDivergence(folder, files), *callbacks, keeping_last],
+        callbacks=[StopOnDivergence(folder, files), SaveOnSignal(folder), *callbacks, keeping_last],
         plugins=[files],
         enable_progress_bar=any(isinstance(callback, ProgressBar) for callback in callbacks),
         enable_model_summary=False,

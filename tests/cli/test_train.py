@@ -195,7 +195,7 @@ def test_an_interrupted_run_says_so(command: Command) -> None:
     with power_cut(KeyboardInterrupt()):
         run = command("train", *SIX)
     assert run.code != 0
-    assert (run.results["status"], run.results["reason"]) == ("failed", "interrupted")
+    assert (run.results["status"], run.results["reason"]) == ("interrupted", "SIGINT")
 
 
 @pytest.mark.parametrize("activation", ACTIVATIONS)

@@ -68,7 +68,7 @@ def test_a_killed_run_ends_like_an_uninterrupted_one(whole: Path, tmp_path: Path
 
 def test_a_finished_run_with_nothing_new_is_shown(command: Command, copy: Path) -> None:  # noqa: F811
     before = {path: path.read_bytes() for path in copy.rglob("*") if path.is_file()}
-    shown = command("train", f"resume={copy}/last.ckpt", folder=None)
+    shown = command("train", f"resume={copy}/last.ckpt", folder="none")
     assert shown.code == 0, shown.text
     assert f"The run in {copy} is finished, and nothing is new." in shown.text
     assert "narrow_road / hno / potential / sin" in shown.text
@@ -125,7 +125,7 @@ def test_another_training_is_refused_with_keys_and_values(command: Command, copy
         (["trainer.max_steps=40"], f"is at step {STEPS}, the run ends at step 40"),
         (["experiment=smoke"], "trainer.validate_every: "),
     ):
-        run = command("train", f"resume={copy}", *words, folder=None)
+        run = command("train", f"resume={copy}", *words, folder="none")
         refused(run, said)
         assert run.code == 2
     assert (copy / "results.json").read_bytes() == before
@@ -134,16 +134,16 @@ def test_another_training_is_refused_with_keys_and_values(command: Command, copy
 @pytest.mark.usefixtures("no_labels")
 def test_what_is_no_run_is_refused(command: Command, copy: Path, tmp_path: Path) -> None:  # noqa: F811
     (copy / "results.json").write_text("[]")
-    refused(command("train", f"resume={copy}", folder=None), f"{copy}/results.json cannot be read")
+    refused(command("train", f"resume={copy}", folder="none"), f"{copy}/results.json cannot be read")
     (copy / "results.json").unlink()
-    refused(command("train", f"resume={copy}", folder=None), f"{copy}/results.json cannot be read (No such file")
-    refused(command("train", f"resume={tmp_path}/none", folder=None), f"There is no checkpoint at {tmp_path}/none")
+    refused(command("train", f"resume={copy}", folder="none"), f"{copy}/results.json cannot be read (No such file")
+    refused(command("train", f"resume={tmp_path}/none", folder="none"), f"There is no checkpoint at {tmp_path}/none")
 
 
 def test_a_run_whose_checkpoints_are_all_damaged_is_refused(command: Command, copy: Path) -> None:  # noqa: F811
     for name in (LAST, PREVIOUS):
         (copy / name).write_bytes(b"half")
-    run = command("train", f"resume={copy}", "trainer.max_steps=200", folder=None)
+    run = command("train", f"resume={copy}", "trainer.max_steps=200", folder="none")
     refused(run, f"Every checkpoint in {copy} is damaged: last.ckpt, previous.ckpt")
     assert run.code == 2
 

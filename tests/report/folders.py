@@ -152,7 +152,7 @@ def write_episodes(folder: Path, results: dict[str, Any], rng: np.random.Generat
 
 
 def write_sweep(root: Path, count: int, *, types: Any = GRID5) -> Path:
-    """A sweep of finished runs with one that failed and one that is running."""
+    """A sweep of finished runs with one that failed and one that was lost."""
     recipes = list(itertools.product(GAMES, OPERATORS, ACTIVATIONS))
     for job in range(count):
         game, operator, activation = recipes[job % len(recipes)]
