@@ -8,8 +8,7 @@ import os
 import socket
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlparse
@@ -18,18 +17,14 @@ import lightning as L
 import torch
 import wandb
 from lightning.pytorch.callbacks import RichProgressBar
-from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger, WandbLogger
+from lightning.pytorch.loggers import Logger, TensorBoardLogger, WandbLogger
 
+from hno.cli.curve import CurveLogger
 from hno.cli.settings import TrainSettings
 from hno.data.labels import Progress, Report
+from hno.report.runs import METRICS
 
 log = logging.getLogger(__name__)
-EXPECTED = (
-    ".*exists and is not empty",  # results.json is there first, on purpose
-    ".*isinstance.treespec, LeafSpec.",  # Lightning's own, from torch 2.13 on
-    ".*does not have many workers",  # batches are made in memory
-)
-"""Warnings of Lightning that mean nothing here."""
 MODES = ("online", "offline", "disabled", "shared", "dryrun", "run")
 """What W&B takes for WANDB_MODE."""
 
@@ -38,26 +33,10 @@ def send_lightning_to_hydra() -> None:
     """Let Lightning's messages and Python's warnings reach Hydra's handlers, console and file."""
     logging.captureWarnings(True)
     warnings.formatwarning = lambda message, category, *_, **__: f"{category.__name__}: {message}"
-    warnings.filterwarnings("ignore", message="|".join(EXPECTED))
-    logging.getLogger("lightning.pytorch.utilities.rank_zero").addFilter(lambda line: "Tip:" not in line.getMessage())
     for name in ("lightning", "lightning.pytorch", "lightning.fabric"):
         logger = logging.getLogger(name)
         logger.handlers.clear()
         logger.propagate = True
-
-
-@contextmanager
-def quiet_lightning() -> Iterator[None]:
-    """Lightning speaks of what goes wrong only, where a program trains."""
-    logger = logging.getLogger("lightning.pytorch")
-    before = logger.level
-    logger.setLevel(logging.WARNING)
-    try:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message="|".join(EXPECTED))
-            yield
-    finally:
-        logger.setLevel(before)
 
 
 def use_threads(count: int | None) -> None:
@@ -66,8 +45,8 @@ def use_threads(count: int | None) -> None:
         torch.set_num_threads(count)
 
 
-def loggers(settings: TrainSettings, folder: Path) -> list[Logger]:
-    """The chosen loggers, each once.
+def loggers(settings: TrainSettings, folder: Path, first: int = 0) -> list[Logger]:
+    """The chosen loggers, each once; they keep what they have of steps before the first one.
 
     Raises:
         RuntimeError: the package of a logger is not installed.
@@ -76,21 +55,25 @@ def loggers(settings: TrainSettings, folder: Path) -> list[Logger]:
     made: list[Logger] = []
     for name in dict.fromkeys(settings.logger.names):
         if name == "csv":
-            made.append(CSVLogger(folder, name="", version="csv"))
+            made.append(CurveLogger(folder / METRICS, first))
         elif name == "tensorboard":
             try:
-                made.append(TensorBoardLogger(folder, name="", version="tensorboard", default_hp_metric=False))
+                made.append(TensorBoardLogger(folder, "", "tensorboard", default_hp_metric=False, purge_step=first))
             except ModuleNotFoundError as error:
                 message = "TensorBoard is not installed: `pip install tensorboard`, or choose logger=csv."
                 raise RuntimeError(message) from error
         elif (mode := wandb_mode(settings.logger.mode)) != "disabled":
-            made.append(
-                WandbLogger(
-                    name=folder.name, save_dir=folder, mode=mode, project=settings.logger.project,
-                    group=folder.parent.name, config=settings.model_dump(),
-                )
-            )  # fmt: skip
+            made.append(_wandb(settings, folder, mode))
     return made
+
+
+def _wandb(settings: TrainSettings, folder: Path, mode: str) -> Logger:
+    """The run of the folder, if W&B left one there: it ends the names of its own folders with the run's id."""
+    known = sorted(folder.glob("wandb/*run-*-*"))
+    return WandbLogger(
+        name=folder.name, save_dir=folder, mode=mode, project=settings.logger.project, group=folder.parent.name,
+        config=settings.model_dump(), id=known[-1].name.rpartition("-")[2] if known else None, resume="allow",
+    )  # fmt: skip
 
 
 def finish_wandb(results: Mapping[str, Any]) -> None:

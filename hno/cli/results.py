@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 import platform
@@ -12,27 +11,11 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel
-
 import hno
 from hno.data.store import replace_whole
 from hno.processes import Interrupted
 
 PACKAGES = ("torch", "lightning", "torchmetrics", "hydra-core", "omegaconf", "wandb", "scipy", "safetensors")
-
-
-NUMBERS_DO_NOT_DEPEND_ON: dict[str, Any] = {
-    **dict.fromkeys(("logger", "resume", "checkpoint", "cache", "workers", "threads"), True),
-    "data": {"cache", "workers"},
-    "trainer": {"print_every", "threads"},
-}
-"""Folders, logging and the number of workers."""
-
-
-def config_hash(settings: BaseModel) -> str:
-    """Hash of what determines a run's numbers."""
-    content = settings.model_dump(exclude=NUMBERS_DO_NOT_DEPEND_ON)
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def versions() -> dict[str, str]:
@@ -66,8 +49,8 @@ class Results:
     def __init__(self, path: Path, head: Mapping[str, Any]) -> None:
         self.path = path
         self.content: dict[str, Any] = {
-            "status": "running", "reason": None, **head, "seconds": {}, "table": [],
-            "episodes": None, "versions": versions(),
+            "status": "running", "reason": None, "seconds": {}, "table": [], "episodes": None, "versions": versions(),
+            **head,
         }  # fmt: skip
         self.write()
 

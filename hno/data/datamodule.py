@@ -261,9 +261,9 @@ class GameData(L.LightningDataModule):
         first = self.trainer.global_step if self.trainer is not None else 0
         return DataLoader(_Steps(self, first), batch_size=None)
 
-    def val_dataloader(self) -> DataLoader[Sample] | list[Any]:
-        """Held-out labelled rows, in one batch; nothing without labels."""
-        return [] if self.val_rows is None else DataLoader([self.val_rows], batch_size=None)  # type: ignore[arg-type]  # a list is a data set
+    def val_dataloader(self) -> DataLoader[Sample | None]:
+        """Held-out labelled rows, in one batch; None without labels."""
+        return DataLoader([self.val_rows], batch_size=None)  # type: ignore[arg-type]  # a list is a data set
 
 
 class _Steps(IterableDataset[Batch]):

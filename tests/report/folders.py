@@ -90,7 +90,7 @@ def make_results(
     return {
         "status": "finished", "reason": None, "game": game, "operator": operator, "function": "value",
         "activation": activation,
-        "seed": seed, "steps": 2000, "config_hash": "0" * 16, "checkpoint": "best.ckpt",
+        "seed": seed, "steps": 2000, "training_hash": "0" * 16, "checkpoint": "best.ckpt",
         "seconds": {"labels": 36.0, "training": round(50 + 20 * rng.random(), 1), "validation": 6.0, "evaluation": 8.0},
         "metrics": {"loss/total": 0.05, "val/value_error": 0.02, "val/costate_error": 0.04},
         "validation": {"collision_rate": 0.0, "excess": -0.008}, "config": config,
