@@ -82,7 +82,10 @@ def stop_if_asked() -> None:
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """Let signals raise `Interrupted` in a block of the main thread; a SIGHUP that is ignored stays so (nohup)."""
+    """Let signals raise `Interrupted` in a block of the main thread.
+
+    Those that are ignored stay so (under nohup, or in the background of a script).
+    """
     if _State.taken or threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -108,7 +111,7 @@ def take_back_signals() -> None:
 
 def _take_signals() -> None:
     for number in SIGNALS:
-        if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
+        if signal.getsignal(number) != signal.SIG_IGN:
             signal.signal(number, _answer)
     signal.signal(signal.SIGALRM, _lose_patience)
 

@@ -30,6 +30,16 @@ random_checkpoint = conftest.random_checkpoint
 SIGNALS = {"SIGTERM": 143, "SIGINT": 130, "SIGHUP": 129, "SIGUSR1": 138}
 
 
+@pytest.fixture(autouse=True)
+def usual_handlers() -> Iterator[None]:
+    """Tests may run in the background of a script, where SIGINT is ignored, which processes inherit."""
+    before = {name: signal.signal(getattr(signal, name), signal.SIG_DFL) for name in SIGNALS}
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    for name, handler in before.items():
+        signal.signal(getattr(signal, name), handler)
+
+
 def send(name: str = "SIGTERM") -> None:
     os.kill(os.getpid(), getattr(signal, name))
 
@@ -73,13 +83,11 @@ def test_signals_of_one_moment_are_one_and_a_later_one_ends_at_once(monkeypatch:
     assert (str(stop), stop.between) == ("SIGTERM", False)
 
 
-def test_what_ignores_hang_ups_goes_on_ignoring_them() -> None:
-    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    try:
-        with interruptible():
-            send("SIGHUP")
-    finally:
-        signal.signal(signal.SIGHUP, before)
+@pytest.mark.parametrize("name", SIGNALS)
+def test_what_ignores_a_signal_goes_on_ignoring_it(name: str) -> None:
+    signal.signal(getattr(signal, name), signal.SIG_IGN)
+    with interruptible():
+        send(name)
 
 
 @pytest.fixture
