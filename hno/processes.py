@@ -93,7 +93,6 @@ def interruptible() -> Iterator[None]:
     _take_signals()
     try:
         yield
-        stop_if_asked()  # whatever a library made of the exception
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
         _State.number, _State.taken = None, False

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import platform
+import shlex
 import signal
 import sys
 import tempfile
@@ -148,7 +149,9 @@ def show_jobs(jobs: Sequence[Job]) -> None:
     ]
     console = Console(width=None if sys.stdout.isatty() else WIDTH)
     console.print(table)
-    for line in (*failures, pages.write(jobs[0].folder.parent)):
+    folder, in_haste = jobs[0].folder.parent, any(results["status"] == "interrupted" for _, results in found)
+    page = f"Page: hno report {shlex.quote(str(folder))}" if in_haste else pages.write(folder)
+    for line in (*failures, page):
         console.print(line, soft_wrap=True, markup=False, highlight=False)
 
 

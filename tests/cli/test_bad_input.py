@@ -206,7 +206,7 @@ def test_resuming_from_what_is_no_run(command: Command, tmp_path: Path, random_c
     (tmp_path / "empty").mkdir()
     foreign.write_bytes(b"these are no weights")
     for place, said in (
-        ("/nowhere/last.ckpt", "There is no checkpoint at /nowhere/last.ckpt"),
+        ("/nowhere/last.ckpt", "There is no checkpoint at /nowhere."),
         (tmp_path / "empty", f"There is no checkpoint at {tmp_path}/empty/last.ckpt"),
         (foreign, f"There is no run to go on with in {foreign}"),
         (random_checkpoint, f"There is no run to go on with in {random_checkpoint.parent}"),

@@ -32,16 +32,20 @@ TINY = (
 
 
 class Moment(NamedTuple):
-    """So many seconds after a hook of the training, in the step after so many; at once where `delay` is 0."""
+    """When a signal ends a process.
+
+    So many seconds after a hook of the training, in the step after so many; at once where `delay` is 0.
+    """
 
     step: int
     hook: str = "on_train_batch_start"
     delay: float = 0.0
+    signal: int = signal.SIGKILL
+    """As a power cut would, or one that can be answered."""
 
-
-def kill() -> None:
-    """End this process as a power cut would."""
-    os.kill(os.getpid(), signal.SIGKILL)
+    def end(self) -> None:
+        """End this process."""
+        os.kill(os.getpid(), self.signal)
 
 
 def train(*words: str, moment: Moment | None = None) -> int:
@@ -68,8 +72,8 @@ def _arm(moment: Moment) -> None:
     def hook(self: Logbook, trainer: L.Trainer, *others: Any) -> None:
         if trainer.global_step == moment.step:
             if not moment.delay:
-                kill()
-            threading.Thread(target=lambda: (time.sleep(moment.delay), kill()), daemon=True).start()
+                moment.end()
+            threading.Thread(target=lambda: (time.sleep(moment.delay), moment.end()), daemon=True).start()
         if original is not None:
             original(self, trainer, *others)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import random
 import shutil
+import signal
 from pathlib import Path
 
 import pytest
@@ -64,6 +65,17 @@ def test_a_killed_run_ends_like_an_uninterrupted_one(whole: Path, tmp_path: Path
     assert (told["step"], told["changes"]) == (step, {})
     assert told["checkpoint"] == (str(folder / LAST) if step else None)
     assert (folder / ".hydra" / "config.yaml").read_bytes() == before
+
+
+@pytest.mark.parametrize("hook", ["on_train_batch_start", "on_validation_start"])
+def test_a_run_that_a_signal_ended_ends_like_an_uninterrupted_one(whole: Path, tmp_path: Path, hook: str) -> None:
+    step = 2 * EVERY if "validation" in hook else EVERY + 7
+    folder, moment = tmp_path / "run", Moment(step, hook, signal=signal.SIGUSR1)
+    assert train(*TINY, f"hydra.run.dir={folder}", moment=moment) == 128 + signal.SIGUSR1
+    assert (results(folder)["status"], results(folder)["reason"]) == ("interrupted", "SIGUSR1")
+    assert train(f"resume={folder}") == 0
+    check_equal(folder, whole)
+    assert results(folder)["resumed"][0]["step"] == step + ("batch" in hook)
 
 
 def test_a_finished_run_with_nothing_new_is_shown(command: Command, copy: Path) -> None:  # noqa: F811
