@@ -105,7 +105,7 @@ def test_every_option_of_what_is_registered_is_in_the_settings() -> None:
     found = options(settings("operator=hno", "sampler.band=0.5", "sampler.rollout.spread=0.1"))
     assert found["sampler"]["band"] == {"share": 0.5, "reach": 1.5}
     assert found["sampler"]["rollout"] == {"share": 0.0, "spread": 0.1}
-    assert found["function"] == {"name": "potential", "exact_terminal": True}
+    assert found["function"] == {"name": "potential", "exact_terminal": True, "members": 1}
     assert set(found["loss"]) == {"value", "costate", "branches", "boundary", "residual"}
     assert settings("function=value").function == {"name": "value", "exact_terminal": True, "members": 1}
 
