@@ -8,7 +8,6 @@ from typing import final
 
 import torch
 from torch import Tensor
-from torch.func import jacrev
 
 from hno.games import Game
 from hno.operators.base import ValueOperator, at_fixed_points, functions
@@ -87,7 +86,7 @@ class PotentialOperator(ValueOperator):
             branches, players = self._functions(*at, self._heads(*at))
             return branches.squeeze(0), (branches.squeeze(0), players.squeeze(0))
 
-        slopes, (branches, players) = jacrev(functions, has_aux=True)(x)
+        slopes, (branches, players) = self.jacobian(functions, has_aux=True)(x)
         best = branches.argmax(-1)
         return _chosen(players, best), _chosen(slopes, best).unsqueeze(0)
 
