@@ -12,11 +12,12 @@ import hno
 
 ROOT = Path(hno.__file__).parent
 LEVELS = (
-    {"types", "registry"},
+    {"types", "registry", "runtime"},
     {"games"},
     {"pontryagin"},
     {"losses", "data"},
     {"operators"},
+    {"export"},
     {"control"},
     {"training", "evaluation"},
     {"report"},

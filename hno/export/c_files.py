@@ -12,7 +12,7 @@ from hno.export.c_source import TYPES, Body, Constants, Place, literal, split
 from hno.export.graph import Node, Program, ordered, stage
 from hno.export.templates import filled
 from hno.export.trace import state_limits
-from hno.games import Game
+from hno.games import Box, Game
 from hno.types import ROUNDING
 
 NAMES = {"controller.h": "hno_controller.h", "controller.c": "hno_controller.c", "example.c": "example.c",
@@ -58,7 +58,7 @@ def c_files(program: Program, game: Game, about: str) -> dict[str, str]:
         "HELPERS": "\n".join(code for name, code in HELPERS.items() if f"{name}(" in text),
         "CONSTANTS": "\n".join([*lines, *constants.lines]), "EARLIEST": literal(-margin, "real"),
         "LATEST": literal(game.horizon + margin, "real"), "PLAYERS_VALUE": "players" if "players" in one else "value",
-        "THETA": _middle(game.type_box.lo, game.type_box.hi), "STATE": _middle(game.initial_box.lo, game.initial_box.hi),
+        "THETA": _middle(game.type_box), "STATE": _middle(game.initial_box),
         **{name: _indented(code, 2 if name == "MANY_EACH" else 1) for name, code in parts.items()},
     }  # fmt: skip
     return {file: filled(name, words) for name, file in NAMES.items()}
@@ -66,7 +66,9 @@ def c_files(program: Program, game: Game, about: str) -> dict[str, str]:
 
 def _place(array: str, node: Node) -> Place:
     names = {"tau": "tau"}
-    return Place(names.get(array, array), 0, tuple(int(np.prod(node.shape[axis + 1 :])) for axis in range(len(node.shape))))
+    return Place(
+        names.get(array, array), 0, tuple(int(np.prod(node.shape[axis + 1 :])) for axis in range(len(node.shape)))
+    )
 
 
 def _function(constants: Constants, given: Mapping[Node, Place], outputs: Mapping[str, Node]) -> list[str]:
@@ -115,10 +117,9 @@ def _listed(values: torch.Tensor) -> str:
     return ", ".join(literal(entry, "real") for entry in values.flatten().tolist())
 
 
-def _middle(lo: torch.Tensor, hi: torch.Tensor) -> str:
-    return _listed((lo + hi) / 2)
+def _middle(box: Box) -> str:
+    return _listed((box.lo + box.hi) / 2)
 
 
 def _indented(lines: Sequence[str], levels: int) -> str:
     return "\n".join("    " * levels + line for line in lines)
-

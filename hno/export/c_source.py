@@ -31,7 +31,11 @@ class Place(NamedTuple):
 
     def at(self, index: Sequence[str]) -> str:
         """An entry, in C."""
-        terms = [i if stride == 1 else f"{stride} * {i}" for i, stride in zip(index, self.strides, strict=True) if stride and i != "0"]
+        terms = [
+            i if stride == 1 else f"{stride} * {i}"
+            for i, stride in zip(index, self.strides, strict=True)
+            if stride and i != "0"
+        ]
         return f"{self.array}[{' + '.join([*([str(self.offset)] if self.offset or not terms else []), *terms])}]"
 
 
@@ -49,7 +53,9 @@ class Constants:
             self._names[key] = name = f"c{len(self._names)}"
             entries = [literal(entry, kind) for entry in value.ravel().tolist()]
             rows = [", ".join(entries[k : k + 8]) for k in range(0, len(entries), 8)]
-            self.lines.append(f"static const {TYPES[kind]} {name}[{value.size}] = {{\n    " + ",\n    ".join(rows) + "};")
+            self.lines.append(
+                f"static const {TYPES[kind]} {name}[{value.size}] = {{\n    " + ",\n    ".join(rows) + "};"
+            )
         return Place(self._names[key], 0, _strides(value.shape))
 
 
@@ -187,25 +193,20 @@ class Body:
         return loops(node.shape, [f"{place.at(index)} = {self.load(source, entry)};"])
 
     def _matmul(self, node: Node, place: Place) -> list[str]:
-        """Rows of the right factor, times numbers of the left one, are added up; or the other way around if it is thin."""
+        """The innermost loop runs over what lies side by side."""
         left, right = node.inputs
-        *batch, rows, columns = node.shape
         index, inner = _indices(node.shape), left.shape[-1]
         *outer, i, j = index
-        clear = loops(node.shape, [f"{place.at(index)} = 0.0f;"])
-        product = f"{place.at(index)} += {self.load(left, [*outer, i, 'k'])} * {self.load(right, [*outer, 'k', j])};"
-        order = [(i, rows), ("k", inner), (j, columns)] if columns >= rows or columns > 1 else [("k", inner), (i, rows), (j, columns)]
-        if columns == 1 and rows > 1:
-            product = self._thin(node, place, index) or product
-        return clear + _nested([*zip(outer, batch, strict=True), *order], [product])
-
-    def _thin(self, node: Node, place: Place, index: Sequence[str]) -> str | None:
-        """A constant matrix times a vector: its columns lie behind each other."""
-        left, right = node.inputs
-        if left.value is None or left.value.ndim != 2:
-            return None
-        turned = self.constants.place(np.ascontiguousarray(left.value.T), "real")
-        return f"{place.at(index)} += {turned.at(['k', index[-2]])} * {self.load(right, ['k', '0'])};"
+        load, times = self.load(left, [*outer, i, "k"]), self.load(right, [*outer, "k", j])
+        if j == "0" and left.value is not None and left.value.ndim == 2:  # a constant matrix: its columns
+            turned = self.constants.place(np.ascontiguousarray(left.value.T), "real")
+            load = turned.at(["k", i])
+        sizes = list(zip(index, node.shape, strict=True))
+        sizes.insert(-2 if j == "0" else -1, ("k", inner))
+        return [
+            *loops(node.shape, [f"{place.at(index)} = 0.0f;"]),
+            *_nested(sizes, [f"{place.at(index)} += {load} * {times};"]),
+        ]
 
     def _sum(self, node: Node, place: Place) -> list[str]:
         return self._reduced(node, place, "0.0f" if node.kind == "real" else "0", "{0} += {1};")
@@ -257,10 +258,12 @@ class Body:
         name, kept = index[axis], [(i, node.shape[k]) for k, i in enumerate(index) if k != axis]
         first = place.at(["0" if i == name else i for i in index])
         body = [
-            f"{TYPES[node.kind]} entry = {self.load(below, index)};", f"{TYPES[node.kind]} *row = &{first};", f"int at = {name};",
-            f"for (; at > 0 && row[(at - 1) * {stride}] {sign} entry; at--) row[at * {stride}] = row[(at - 1) * {stride}];",
+            f"{TYPES[node.kind]} entry = {self.load(below, index)}, *row = &{first};",
+            f"int at = {name};",
+            f"for (; at > 0 && row[(at - 1) * {stride}] {sign} entry; at--)",
+            f"    row[at * {stride}] = row[(at - 1) * {stride}];",
             f"row[at * {stride}] = entry;",
-        ]  # fmt: skip
+        ]
         return _nested([*kept, (name, node.shape[axis])], body)
 
     def store(self, node: Node, array: str) -> None:
@@ -286,7 +289,9 @@ def loops(shape: Sequence[int], body: Sequence[str]) -> list[str]:
 
 def _nested(sizes: Sequence[tuple[str, int]], body: Sequence[str]) -> list[str]:
     sizes = [(name, size) for name, size in sizes if name != "0"]
-    lines = [f"{'    ' * depth}for (int {name} = 0; {name} < {size}; {name}++)" for depth, (name, size) in enumerate(sizes)]
+    lines = [
+        f"{'    ' * depth}for (int {name} = 0; {name} < {size}; {name}++)" for depth, (name, size) in enumerate(sizes)
+    ]
     pad = "    " * len(sizes)
     if len(body) == 1:
         return [*lines, f"{pad}{body[0]}"]
@@ -322,4 +327,3 @@ def split(nodes: Sequence[Node], name: str) -> tuple[list[Node], list[Node]]:
     """Nodes that do not depend on an input, and those that do."""
     apart = [[node for node in nodes if (name in node.needs) == depends] for depends in (False, True)]
     return apart[0], apart[1]
-

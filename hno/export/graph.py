@@ -8,17 +8,18 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple, final
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 Kind = Literal["real", "int", "bool"]
 DTYPES: dict[Kind, Any] = {"real": np.float64, "int": np.int64, "bool": np.bool_}
 Shape = tuple[int, ...]
 """A negative size -k stands for k times the size of the batch."""
 
-ELEMENTWISE = frozenset(
-    "add sub mul div neg sin cos tan asin acos atan exp log sqrt abs floor tanh sigmoid relu maximum minimum pow "
-    "remainder where lt le gt ge eq and or not cast".split()
-)
+ELEMENTWISE = frozenset((
+    "add", "sub", "mul", "div", "neg", "sin", "cos", "tan", "asin", "acos", "atan", "exp", "log", "sqrt", "abs",
+    "floor", "tanh", "sigmoid", "relu", "maximum", "minimum", "pow", "remainder", "where", "lt", "le", "gt", "ge",
+    "eq", "ne", "and", "or", "not", "cast",
+))  # fmt: skip
 """Operations on every entry, whose operands are broadcast."""
 
 
@@ -76,11 +77,13 @@ class Builder:
 
     def input(self, name: str, shape: Sequence[int]) -> Node:
         """A named input."""
-        return self._kept(("input", name), Node("input", (), tuple(shape), "real", {"name": name}, None, frozenset([name])))
+        return self._kept(
+            ("input", name), Node("input", (), tuple(shape), "real", {"name": name}, None, frozenset([name]))
+        )
 
-    def constant(self, value: object, kind: Kind = "real") -> Node:
+    def constant(self, value: ArrayLike, kind: Kind = "real") -> Node:
         """A constant."""
-        array = np.ascontiguousarray(np.asarray(value, DTYPES[kind])).reshape(np.shape(value))
+        array = np.array(value, DTYPES[kind], order="C")
         return self._kept((kind, array.shape, array.tobytes()), Node("constant", (), array.shape, kind, {}, array))
 
     def node(self, op: str, inputs: Sequence[Node], shape: Sequence[int], kind: Kind, **attributes: Any) -> Node:
@@ -105,7 +108,11 @@ class Builder:
     def _simpler(self, op: str, inputs: list[Node], shape: Shape) -> Node | None:
         first, last = inputs[0], inputs[-1]
         if op in ("add", "mul") and first.value is not None:  # constants stand behind
-            return self.elementwise(op, [last, first], shape, "real") if last.value is None and first.kind == "real" else None
+            return (
+                self.elementwise(op, [last, first], shape, "real")
+                if last.value is None and first.kind == "real"
+                else None
+            )
         if last.value is None or last.kind != "real" or first.kind != "real" or len(inputs) != 2:
             return None
         if op == "div":
@@ -208,7 +215,9 @@ def unified(one: Program, other: Program, sizes: tuple[int, int]) -> Program:
     if len(nodes[0]) != len(nodes[1]):
         raise BatchError("it takes another number of operations in another batch")
     for a, b in zip(*nodes, strict=True):
-        found[a] = _merged(built, a, b, tuple(_size(*pair, sizes) for pair in zip(a.shape, b.shape, strict=True)), found)
+        found[a] = _merged(
+            built, a, b, tuple(_size(*pair, sizes) for pair in zip(a.shape, b.shape, strict=True)), found
+        )
     outputs = {name: found[node] for name, node in one.outputs.items()}
     return Program({name: found[node] for name, node in one.inputs.items() if node in found}, outputs)
 
@@ -275,7 +284,9 @@ def stage(outputs: Iterable[Node], early: frozenset[str]) -> list[Node]:
         if all(size >= 0 for size in node.shape[1:]) and node.op not in ("input", "reshape", "expand"):
             yield node
         else:
-            yield from ((node,) if node.op == "input" else (cut for below in node.inputs if below.needs for cut in cuts(below)))
+            yield from (
+                (node,) if node.op == "input" else (cut for below in node.inputs if below.needs for cut in cuts(below))
+            )
 
     later = [node for node in nodes if not first(node)]
     edges = [below for node in later for below in node.inputs if first(below)] + [end for end in ends if first(end)]

@@ -14,14 +14,25 @@ Lowered = Node | tuple[Node | None, ...]
 Rule = Callable[..., Lowered]
 RULES: dict[str, Rule] = {}
 """By the name of the operation: (builder, result, *arguments) -> node."""
-SAME = dict.fromkeys(
-    "sin cos tan asin acos atan exp log sqrt abs floor tanh sigmoid relu maximum minimum neg lt le gt ge eq".split()
-)
-ELEMENTWISE = {name: name for name in SAME} | {
-    "mul": "mul", "div": "div", "where": "where", "bitwise_not": "not", "logical_not": "not", "bitwise_and": "and",
-    "logical_and": "and", "bitwise_or": "or", "logical_or": "or", "ne": "ne", "remainder": "remainder",
+ELEMENTWISE = {name: name for name in (
+    "sin", "cos", "tan", "asin", "acos", "atan", "exp", "log", "sqrt", "abs", "floor", "tanh", "sigmoid", "relu", "neg",
+    "maximum", "minimum", "lt", "le", "gt", "ge", "eq", "ne", "mul", "div", "where", "remainder",
+)} | {
+    "bitwise_not": "not", "logical_not": "not", "bitwise_and": "and", "logical_and": "and", "bitwise_or": "or",
+    "logical_or": "or",
 }  # fmt: skip
-FREE = ("arange", "full", "scalar_tensor", "full_like", "zeros_like", "ones_like", "empty_like", "new_zeros", "new_full")
+"""Operations on every entry, by torch's names and the graph's."""
+FREE = (
+    "arange",
+    "full",
+    "scalar_tensor",
+    "full_like",
+    "zeros_like",
+    "ones_like",
+    "empty_like",
+    "new_zeros",
+    "new_full",
+)
 """Operations whose result depends on no entry of any tensor."""
 
 
@@ -52,10 +63,11 @@ def lowered(builder: Builder, name: str, result: Any, args: Sequence[Any], kwarg
             return elementwise(builder, ELEMENTWISE[kind], result, *args)
         return RULES[kind](builder, result, *args, **{key: kwargs[key] for key in kwargs if key in NAMED})
     except (KeyError, NotImplementedError) as error:
+        detail = f" {error}" if isinstance(error, NotImplementedError) else ""
         known = ", ".join(sorted({*RULES, *ELEMENTWISE, *FREE}))
         raise UnsupportedError(
-            f"{name} cannot be exported{f' ({error})' if isinstance(error, NotImplementedError) else ''}. Write the game's "
-            f"sensors, terminal value and best response, or the network, with other operations: {known}."
+            f"{name}{detail} cannot be exported. Write the game's sensors, terminal value and best response, or the "
+            f"network, with other operations: {known}."
         ) from error
 
 
@@ -269,7 +281,7 @@ def _slice_scatter(
 
 
 @rule("select_scatter")
-def _select_scatter(b: Builder, out: Tensor, x: Node, source: Node, dim: int, index: int) -> Node:
+def _select_scatter(b: Builder, out: Tensor, x: Node, source: Node, dim: int, index: int) -> Lowered:
     axis = dim % out.dim()
     place = index % out.shape[axis]
     row = b.reshape(source, (*out.shape[:axis], 1, *out.shape[axis + 1 :]))
@@ -277,7 +289,9 @@ def _select_scatter(b: Builder, out: Tensor, x: Node, source: Node, dim: int, in
 
 
 @rule("index_put")
-def _index_put(b: Builder, out: Tensor, x: Node, indices: Sequence[Node | None], values: Node, add: bool = False) -> Node:
+def _index_put(
+    b: Builder, out: Tensor, x: Node, indices: Sequence[Node | None], values: Node, add: bool = False
+) -> Node:
     """At known places of one axis, each once."""
     places = [place for place, index in enumerate(indices) if index is not None]
     index = indices[places[0]]
@@ -312,7 +326,7 @@ def _axes(x: Node, dims: Any) -> list[int]:
 
 def _reduction(op: str) -> Rule:
     def lower(b: Builder, out: Tensor, x: Node, dims: Any = None, keepdim: bool = False) -> Node:
-        return b.reduce(op, b.cast(x, kind_of(out)) if op != "argmax" else x, _axes(x, dims), out.shape)
+        return b.reduce(op, x if op == "argmax" else b.cast(x, kind_of(out)), _axes(x, dims), out.shape)
 
     return lower
 
@@ -331,10 +345,11 @@ def _mean(b: Builder, out: Tensor, x: Node, dims: Any = None, keepdim: bool = Fa
 @rule("sort")
 def _sort(b: Builder, out: Sequence[Tensor], x: Node, dim: int = -1, descending: bool = False) -> Lowered:
     """The values; where they came from is not known."""
-    axis = dim % len(x.shape)
-    if x.shape[axis] == 1:
-        return x, None
-    return b.node("sort", [x], x.shape, x.kind, axis=axis, descending=descending), None
+    return _sorted(b, x, dim % len(x.shape), descending), None
+
+
+def _sorted(b: Builder, x: Node, axis: int, descending: bool) -> Node:
+    return x if x.shape[axis] == 1 else b.node("sort", [x], x.shape, x.kind, axis=axis, descending=descending)
 
 
 @rule("median")
@@ -342,7 +357,4 @@ def _median(b: Builder, out: Sequence[Tensor], x: Node, dim: int = -1, keepdim: 
     """The middle one; the lower one of two."""
     axis = dim % len(x.shape)
     middle = (x.shape[axis] - 1) // 2
-    values = _sort(b, (), x, axis)
-    assert isinstance(values, tuple)
-    assert values[0] is not None
-    return b.reshape(b.slice(values[0], axis, middle, middle + 1), out[0].shape), None
+    return b.reshape(b.slice(_sorted(b, x, axis, descending=False), axis, middle, middle + 1), out[0].shape), None

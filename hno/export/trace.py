@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import operator
 import warnings
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -25,43 +26,46 @@ INPUTS = "tau", "x", "theta"
 Traced = Callable[[Tensor, Tensor, Tensor], dict[str, Tensor]]
 
 
-def in_double(operator: ValueOperator) -> ValueOperator:
+def in_double(learned: ValueOperator) -> ValueOperator:
     """A copy in double precision, without gradients."""
-    return copy.deepcopy(operator).cpu().double().eval().requires_grad_(False)
+    return copy.deepcopy(learned).cpu().double().eval().requires_grad_(False)
 
 
-def answers(operator: ValueOperator) -> Traced:
+def answers(learned: ValueOperator) -> Traced:
     """Everything that the operator says of states, each with types of its own: its field and the controls."""
 
     def found(tau: Tensor, x: Tensor, theta: Tensor) -> dict[str, Tensor]:
-        field = operator.field(Points(tau, x, theta), Types(theta, torch.arange(len(tau), device=x.device)))
-        return {**field._asdict(), "control": operator.problem.optimal_control(x, field.costate)}
+        field = learned.field(Points(tau, x, theta), Types(theta, torch.arange(len(tau), device=x.device)))
+        return {**field._asdict(), "control": learned.problem.optimal_control(x, field.costate)}
 
     return found
 
 
-def answers_at_one_state(operator: ValueOperator) -> Traced:
-    """V_i, costates and controls of a batch of one; derivatives run forward, so that what does not depend on the types
-    is apart."""
-    operator = copy.copy(operator)
-    operator.jacobian = jacfwd
+def answers_at_one_state(learned: ValueOperator) -> Traced:
+    """V_i, costates and controls of a batch of one, by derivatives that run forward.
+
+    What does not depend on the types is apart then.
+    """
+    learned = copy.copy(learned)
+    learned.jacobian = jacfwd
 
     def found(tau: Tensor, x: Tensor, theta: Tensor) -> dict[str, Tensor]:
-        value, costate = operator.value_and_costate(tau[0], x[0], theta[0])
-        control = operator.problem.optimal_control(x, costate.unsqueeze(0))
+        value, costate = learned.value_and_costate(tau[0], x[0], theta[0])
+        control = learned.problem.optimal_control(x, costate.unsqueeze(0))
         return {"value": value.unsqueeze(0), "costate": costate.unsqueeze(0), "control": control}
 
     return found
 
 
-def for_any_batch(operator: ValueOperator) -> Program:
+def for_any_batch(learned: ValueOperator) -> Program:
     """`answers` as a graph of any batch.
 
     Raises:
         UnsupportedError: an operation of the game or the network is not on the list, see `hno.export.lowering`.
     """
     try:
-        return unified(*(traced(answers(operator), operator.game, size) for size in SIZES), SIZES)
+        few, more = (traced(answers(learned), learned.game, size) for size in SIZES)
+        return unified(few, more, SIZES)
     except BatchError as error:
         raise UnsupportedError(f"The operator cannot be exported for any batch: {error}.") from error
 
@@ -86,9 +90,10 @@ def state_limits(game: Game) -> tuple[Tensor, Tensor]:
 def traced(function: Traced, game: Game, size: int) -> Program:
     """The graph of a function of (tau, x, theta) for a batch of one size. Raises as `for_any_batch`."""
     given = points(game, size, 0)
+    table: Any = core_aten_decompositions()
     with warnings.catch_warnings(action="ignore"), torch.enable_grad():
         first = make_fx(function)(*given.values())
-        plain = make_fx(functionalize(first), decomposition_table=core_aten_decompositions())(*given.values())
+        plain = make_fx(functionalize(first), decomposition_table=table)(*given.values())
     plain.graph.eliminate_dead_code()
     return _program(plain, given)
 
@@ -113,16 +118,12 @@ def _program(module: fx.GraphModule, given: Mapping[str, Tensor]) -> Program:
 
 
 def _called(builder: Builder, node: fx.Node, values: dict[fx.Node, Any], nodes: dict[fx.Node, Any]) -> tuple[Any, Any]:
-    args, kwargs = fx.node.map_arg((node.args, node.kwargs), values.__getitem__)
-    result = node.target(*args, **kwargs)  # type: ignore[operator]  # fx types targets as text too
-    args, kwargs = fx.node.map_arg((list(node.args), dict(node.kwargs)), nodes.__getitem__)
-    if "getitem" in str(node.target):
-        return result, args[0][args[1]]
-    found = lowered(builder, str(node.target), result, [_plain(arg) for arg in args], kwargs)
-    return result, found
-
-
-def _plain(argument: Any) -> Any:
-    """fx's immutable lists as lists."""
-    return list(argument) if isinstance(argument, (list, tuple)) else argument
-
+    """What an operation gives, and its node or nodes."""
+    args: Any = fx.node.map_arg(node.args, values.__getitem__)
+    function: Any = node.target
+    result = function(*args, **fx.node.map_arg(node.kwargs, values.__getitem__))
+    given: Any = fx.node.map_arg(node.args, nodes.__getitem__)
+    if function is operator.getitem:
+        return result, given[0][given[1]]
+    lists = [list(arg) if isinstance(arg, (list, tuple)) else arg for arg in given]
+    return result, lowered(builder, str(function), result, lists, dict(node.kwargs))

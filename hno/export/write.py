@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hno.export.c_files import MANY, c_files
-from hno.export.graph import Program
 from hno.export.numpy_source import numpy_files
 from hno.export.trace import Traced, answers, answers_at_one_state, for_any_batch, in_double, points, traced
 from hno.games import Game, games
@@ -30,8 +29,8 @@ TOLERANCE = 1e-5
 POINTS = 1000
 """Random questions by which every artefact is checked."""
 NUDGE, JUMP, SWITCHES = 1e-4, 1e-4, 0.05
-"""Where the operator's answers at two points, `NUDGE` of the boxes to both sides of a question, miss the answer in between
-by more than `JUMP` on average, it takes another branch, or a sensor switches. Rounding decides there, so that errors mean
+"""Where the operator's answers at two points, `NUDGE` of the boxes to both sides of a question, miss that in between by
+more than `JUMP` on average, it takes another branch, or a sensor switches. Rounding decides there, so that errors mean
 nothing. `SWITCHES` is the share of all questions that they may be."""
 
 
@@ -83,7 +82,7 @@ def export(operator: ValueOperator, to: str, folder: str | Path, origin: Mapping
     if place.exists() and not (place.is_dir() and ((place / MANIFEST).exists() or not any(place.iterdir()))):
         raise ExportError(f"{place} holds something else than an exported controller: name a new folder.")
     double = in_double(operator)
-    about = _about(double, to, origin or {})
+    about = _about(operator, to, origin or {})
     files = KINDS[to](double, about)
     place.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=place.parent, prefix=f".{place.name}.") as made:
@@ -93,8 +92,8 @@ def export(operator: ValueOperator, to: str, folder: str | Path, origin: Mapping
         checked = check(load(draft), double)
         if checked.error > TOLERANCE or checked.left_out > SWITCHES:
             raise ExportError(
-                f"The controller for {to} is not written: it differs from the operator by {checked.error:.1e} of the largest "
-                f"entry ({TOLERANCE:g} are allowed), and {checked.left_out:.1%} of the questions cannot be compared."
+                f"The controller for {to} is not written: it differs from the operator by {checked.error:.1e} of the "
+                f"largest entry ({TOLERANCE:g} are allowed), and {checked.left_out:.1%} of the questions say nothing."
             )
         _fill(draft, files, about | {"errors": checked.errors})
         if place.exists():
@@ -114,15 +113,15 @@ def _fill(folder: Path, files: Mapping[str, str | bytes], about: Mapping[str, An
 def _about(operator: ValueOperator, kind: str, origin: Mapping[str, Any]) -> dict[str, Any]:
     """The manifest but for the files."""
     game = operator.game
-    one = {name: part[:1] for name, part in points(game, 1, 0).items()}
-    outputs = {name: list(part.shape[1:]) for name, part in answers(operator)(*one.values()).items()}
+    one = (part.to(operator.value_scale) for part in points(game, 1, 0).values())
+    outputs = {name: list(part.shape[1:]) for name, part in answers(operator)(*one).items()}
     boxes = {name: _ends(getattr(game, name)) for name in ("state_box", "type_box", "control_box", "initial_box")}
     return {
         "format": FORMAT, "kind": kind, "version": metadata.version("hno"), "game": _name(game),
         "constants": dict(game.constants), "fingerprint": game.fingerprint(), "potential": operator.potential,
         "players": game.players, "states": game.state_dim, "controls": game.control_dim, "horizon": game.horizon,
-        "rounding": ROUNDING, **boxes, "units": {"tau": "s", "constraint": game.constraint_unit, "others": "the game's"},
-        "outputs": outputs, "origin": dict(origin),
+        "rounding": ROUNDING, **boxes, "origin": dict(origin), "outputs": outputs,
+        "units": {"tau": "s", "constraint": game.constraint_unit, "others": "the game's"},
     }  # fmt: skip
 
 
@@ -180,11 +179,16 @@ def _steady(
     """At which questions nothing jumps, see `NUDGE`."""
     game, generator = operator.game, torch.Generator().manual_seed(seed)
     widths = {"tau": torch.tensor(game.horizon), "x": game.state_box.width, "theta": game.type_box.width}
-    steps = {name: NUDGE * widths[name] * torch.randn(part.shape, generator=generator) for name, part in asked.items()}
-    sides = [_said(answers(operator), {name: asked[name] + sign * steps[name] for name in asked}) for sign in (-1, 1)]
     steady = np.ones(len(asked["tau"]), bool)
-    for name, part in wanted.items():
-        steady &= ~(_distance((sides[0][name] + sides[1][name]) / 2, part) > JUMP * _size(part))
+    for _ in range(4):
+        step = {
+            name: NUDGE * widths[name] * torch.randn(part.shape, generator=generator) for name, part in asked.items()
+        }
+        low, high = (
+            _said(answers(operator), {name: asked[name] + sign * step[name] for name in asked}) for sign in (-1, 1)
+        )
+        for name, part in wanted.items():
+            steady &= ~(_distance((low[name] + high[name]) / 2, part) > JUMP * _size(part))
     return steady
 
 
@@ -200,4 +204,3 @@ def _distance(a: NDArray[Any], b: NDArray[Any]) -> NDArray[Any]:
 
 def _size(part: NDArray[Any]) -> float:
     return float(np.abs(part[np.isfinite(part)]).max(initial=1e-30))
-

@@ -45,10 +45,12 @@ def read_manifest(folder: str | Path) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         raise ArtefactError(f"{place / MANIFEST} is damaged. Export the controller again.") from error
     if not found:
-        raise ArtefactError(f"{place / MANIFEST} is damaged: it does not match its checksum. Export the controller again.")
+        raise ArtefactError(
+            f"{place / MANIFEST} is damaged: it does not match its checksum. Export the controller again."
+        )
     if content.get("format") != FORMAT:
         raise ArtefactError(
-            f"{place} has format {content.get('format')!r:.20}, this version of hno reads format {FORMAT}: export it again."
+            f"{place} has format {content.get('format')!r:.20}, this version reads format {FORMAT}: export it again."
         )
     for name, digest in content["files"].items():
         _check(place / name, digest)
@@ -76,6 +78,8 @@ class Artefact(abc.ABC):
 
     def answers(self, tau: ArrayLike, x: ArrayLike, theta: ArrayLike) -> dict[str, NDArray[np.float32]]:
         """Everything that it says of states, in single precision, by the names in its manifest.
+
+        An answer that is not finite, far outside the PDE box, is NaN or infinite here.
 
         Args:
             tau: times to go, (B,), s.

@@ -10,7 +10,7 @@ import shutil
 import subprocess
 import tempfile
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, final
 
@@ -23,7 +23,7 @@ Reals = NDArray[np.float32]
 
 
 def load(folder: str | Path) -> Artefact:
-    """The controller in a folder that `hno export` wrote; one in C is compiled first.
+    """Open the controller in a folder that `hno export` wrote; one in C is compiled first.
 
     Its code runs with your rights: load what you or somebody whom you trust has exported. Checksums detect damage, not
     malice.
@@ -32,7 +32,12 @@ def load(folder: str | Path) -> Artefact:
         ArtefactError: see `read_manifest`; or what it needs is missing here: a compiler, onnxruntime, torch.
     """
     about = read_manifest(folder)
-    kinds: dict[str, type[Artefact]] = {"numpy": _NumPy, "c": _C, "onnx": _ONNX, "torch": _Torch}
+    kinds: dict[str, Callable[[Mapping[str, Any], Path], Artefact]] = {
+        "numpy": _NumPy,
+        "c": _C,
+        "onnx": _ONNX,
+        "torch": _Torch,
+    }
     if about.get("kind") not in kinds:
         raise ArtefactError(f"{folder} is of the kind {about.get('kind')!r:.20}; known are {', '.join(kinds)}.")
     return kinds[about["kind"]](about, Path(folder))
@@ -51,12 +56,14 @@ class _NumPy(Artefact):
     def _answers(self, tau: Reals, x: Reals, theta: Reals) -> dict[str, Reals]:
         if len(tau) > 1:
             return dict(self._module.batch(tau, x, theta))
-        found = self._module.everything(self._module.prepare(theta[0]), float(tau[0]), x[0])
-        return {name: part[None] for name, part in found.items()}
+        found = self._module._everything1(self._module._prepare1(theta), tau, x)
+        return dict(zip(self._module.OUTPUTS, found, strict=True))
 
 
 _GLUE = """
 #include "hno_controller.h"
+#include <math.h>
+#include <stddef.h>
 int glue_prepared(void) { return (int)sizeof(hno_prepared); }
 int glue_prepare(int count, const float *theta, hno_prepared *prepared)
 {
@@ -72,7 +79,12 @@ int glue_answers(int count, const int *which, const hno_prepared *prepared, cons
 {
     int worst = 0;
     for (int k = 0; k < count && worst >= 0; k++) {
-        const int code = hno_everything(&prepared[which[k]], tau[k], x + k * HNO_PLAYERS * HNO_STATES, &answers[k]);
+        int code = hno_everything(&prepared[which[k]], tau[k], x + k * HNO_PLAYERS * HNO_STATES, &answers[k]);
+        if (code == HNO_ERROR_NOT_FINITE) { /* the question is: there is no answer */
+            float *entries = (float *)&answers[k];
+            for (size_t entry = 0; entry < sizeof(hno_answer) / sizeof(float); entry++) entries[entry] = NAN;
+            code = HNO_WARNING_STATE;
+        }
         worst = code < 0 ? code : worst | code;
     }
     return worst;
@@ -109,7 +121,9 @@ def _compiled(folder: Path) -> ctypes.CDLL:
     names = [os.environ.get("CC", "cc"), "gcc", "clang"]
     compiler = next((found for name in names if (found := shutil.which(name))), None)
     if compiler is None:
-        raise ArtefactError(f"{folder} is in C, and there is no compiler: none of {', '.join(names)}. Install one, or set CC.")
+        raise ArtefactError(
+            f"{folder} is in C, and there is no compiler: none of {', '.join(names)}. Install one, or set CC."
+        )
     with tempfile.TemporaryDirectory() as made:
         library, glue = Path(made) / "controller.so", Path(made) / "glue.c"
         glue.write_text(_GLUE, encoding="utf-8")
