@@ -157,17 +157,11 @@ def _function(content: dict[str, Any], info: ValidationInfo) -> dict[str, Any]:
 
     Files of games set `SHARED` options; a function that does not know them is not given them.
     """
-    following = content.get("name") == AUTO
-    if following:
+    if content.get("name") == AUTO:
         chosen = info.data.get("game")  # none where the game itself is refused
         content = {**content, "name": "potential" if chosen is not None and chosen.potential else "value"}
     schema = _schema("function", content.get("name"), {"name": (str, ...)})
     given = {key for key in SHARED if f"function.{key}" in (info.context or {}).get("given", ())}
-    if following and (unknown := sorted(given - schema.model_fields.keys())):
-        raise ValueError(
-            f"{', '.join(unknown)} is no option of a potential, which function={AUTO} stands for in this game; choose "
-            "function=value to learn the players' values."
-        )
     dropped = set(SHARED) - schema.model_fields.keys() - given
     return validated(schema, {k: v for k, v in content.items() if k not in dropped}).model_dump()
 

@@ -9,13 +9,13 @@ from torch import Tensor
 
 from hno.games.base import games
 from hno.games.box import Box
-from hno.games.collision import CollisionAvoidance
-from hno.games.kinematics import DEGREE, unicycle_drift
+from hno.games.cars import Cars
+from hno.games.kinematics import DEGREE
 
 
 @final
 @games.register("lane_change")
-class LaneChange(CollisionAvoidance):
+class LaneChange(Cars):
     """Unicycles (px, py, psi, v) with different target lanes; controls (angular velocity, acceleration).
 
     Args:
@@ -44,14 +44,6 @@ class LaneChange(CollisionAvoidance):
         self.initial_box = Box(
             [[0, 1.25, -DEGREE, 18], [0, 5.25, -DEGREE, 18]], [[3, 2.75, DEGREE, 25], [3, 6.75, DEGREE, 25]]
         )
-        self.control_box = Box([-1, -5], [1, 10])
-        self.type_box = Box([1, 1], [5, 5])
-        self.register_buffer("input_matrix", torch.eye(4)[:, 2:])
-        self.register_buffer("effort_weight", torch.tensor([100.0, 1.0]))
-
-    def drift(self, x: Tensor) -> Tensor:
-        """Motion at zero control, (B, 2, 4)."""
-        return unicycle_drift(x)
 
     def positions(self, x: Tensor) -> Tensor:
         """(px, py) of both players in the same frame, m, (B, 2, 2)."""

@@ -9,13 +9,13 @@ from torch import Tensor
 
 from hno.games.base import games
 from hno.games.box import Box
-from hno.games.collision import CollisionAvoidance
-from hno.games.kinematics import DEGREE, unicycle_drift
+from hno.games.cars import Cars
+from hno.games.kinematics import DEGREE
 
 
 @final
 @games.register("narrow_road")
-class NarrowRoad(CollisionAvoidance):
+class NarrowRoad(Cars):
     """Unicycles (px, py, psi, v), each driving towards the other; controls (angular velocity, acceleration).
 
     Args:
@@ -36,14 +36,6 @@ class NarrowRoad(CollisionAvoidance):
         self.first_sensor, self.sensor_count = radius - 0.25, 50
         self.state_box = Box([[15, 0, -0.2, 18]] * 2, [[95, 8, 0.2, 29]] * 2)
         self.initial_box = Box([[15, 3.25, -DEGREE, 18]] * 2, [[20, 4.75, DEGREE, 25]] * 2)
-        self.control_box = Box([-1, -5], [1, 10])
-        self.type_box = Box([1, 1], [5, 5])
-        self.register_buffer("input_matrix", torch.eye(4)[:, 2:])
-        self.register_buffer("effort_weight", torch.tensor([100.0, 1.0]))
-
-    def drift(self, x: Tensor) -> Tensor:
-        """Motion at zero control, (B, 2, 4)."""
-        return unicycle_drift(x)
 
     def positions(self, x: Tensor) -> Tensor:
         """Player 2's px runs from the other end of the road, m, (B, 2, 2)."""

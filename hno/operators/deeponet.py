@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from hno.operators.activations import Activation, ClosedFormActivation
 from hno.operators.network import Inputs, Network, networks
-from hno.operators.value_gradient import Kernels, Layer, value_gradient
+from hno.operators.value_gradient import Kernels, Layer, compiled, value_gradient
 
 TABLE = 512
 """Branch inputs up to which values are computed for all of them."""
@@ -126,6 +126,10 @@ class DeepONet(Network):
         coefficient = branch @ last.weight
         value, gradient = value_gradient(type(activation), y.detach(), which, coefficient, hidden, self.kernels)
         return value + (branch @ last.bias)[which], gradient
+
+    def compile_kernels(self) -> None:
+        """Train through `torch.compile`."""
+        self.kernels = compiled()
 
     def _pooled(self, y: Tensor) -> Tensor:
         """What the trunk sees, (R, trunk inputs)."""

@@ -7,19 +7,14 @@ from collections.abc import Callable, Sequence
 from typing import final
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from hno.games import Game
 from hno.operators.base import FieldFunction, ValueOperator, at_fixed_points, functions
-from hno.operators.deeponet import DeepONet
 from hno.operators.inputs import Encoding, distinct_types
-from hno.operators.network import Inputs, Network
-from hno.operators.value_gradient import compiled
+from hno.operators.network import Ensemble, Inputs, Network, median
 from hno.pontryagin.adjoint import terminal_costate
 from hno.types import Field, Points, Types
-
-MOST = 99
-"""Members that an ensemble may have: more are a slip of the pen, or a file that is to fill the memory."""
 
 
 @final
@@ -31,32 +26,23 @@ class GradientOperator(ValueOperator):
         game: the game.
         network: builds one network for the sizes of its inputs.
         exact_terminal: V = -g + (tau / horizon) N rather than N, so that the boundary condition holds exactly.
-        members: networks that are trained on the same batches from different weights, an odd number; the operator is
-            their median, entry by entry. Where two equilibria cost nearly the same, each network rounds off the ridge
-            between them in its own way; the median follows the majority.
+        members: of the ensemble of networks.
 
     Raises:
-        ValueError: `members` is no odd whole number, or above `MOST`.
+        ValueError: see `Ensemble`.
     """
 
     def __init__(
         self, game: Game, network: Callable[[Inputs], Network], exact_terminal: bool = True, members: int = 1
     ) -> None:
-        if not (type(members) is int and 0 < members <= MOST and members % 2):
-            raise ValueError(
-                "function.members must be an odd whole number, such as 1 or 3, so that there is a median, and at most "
-                f"{MOST}; got {members!r}."
-            )
         super().__init__(game)
         self.meets_terminal = exact_terminal
         self.encoding = Encoding(game)
-        self.networks = nn.ModuleList(network(self.encoding.sizes) for _ in range(members))
+        self.networks = Ensemble(lambda: network(self.encoding.sizes), members)
 
     def compile_kernels(self) -> None:
         """Train through `torch.compile`."""
-        for network in self.networks:
-            if isinstance(network, DeepONet):
-                network.kernels = compiled()
+        self.networks.compile_kernels()
 
     def value(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
         """The median of the members' values, (B, P)."""
@@ -85,18 +71,13 @@ class GradientOperator(ValueOperator):
     def field(self, points: Points, types: Types | None = None) -> Field:
         """Value, time derivative and every costate of all players: medians over the members, entry by entry."""
         types = types or distinct_types(points.theta)
-        found = [self._member(network, points, types) for network in self._networks()]
-        if len(found) == 1:
-            return found[0]
-        return Field(*(torch.stack(parts).median(0).values for parts in zip(*found, strict=True)))
+        found = [self._member(network, points, types) for network in self.networks.networks]
+        return Field(*map(median, zip(*found, strict=True)))
 
     @property
     def members(self) -> Sequence[FieldFunction]:
         """The field of every network."""
-        return [functools.partial(self._member, network) for network in self._networks()]
-
-    def _networks(self) -> list[Network]:
-        return [network for network in self.networks if isinstance(network, Network)]
+        return [functools.partial(self._member, network) for network in self.networks.networks]
 
     def _member(self, network: Network, points: Points, types: Types | None = None) -> Field:
         """The field of one network."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -77,3 +78,48 @@ class Network(nn.Module, abc.ABC):
             value = self(point, sensors.clone(), which.clone())
             (gradient,) = torch.autograd.grad(value.sum(), point, create_graph=training)
         return (value, gradient) if training else (value.detach(), gradient)
+
+    def compile_kernels(self) -> None:
+        """Train through `torch.compile`, where the network knows how; it pays in long runs."""
+
+
+MOST = 99
+"""Members that an ensemble may have: more are a slip of the pen, or a file that is to fill the memory."""
+
+
+class Ensemble(nn.ModuleList):
+    """Networks trained on the same batches from different weights; what counts is their median, entry by entry.
+
+    Where two equilibria cost nearly the same, each network rounds off the ridge between them in its own way; the median
+    follows the majority.
+
+    Args:
+        build: makes one network.
+        members: how many, an odd number.
+
+    Raises:
+        ValueError: `members` is no odd whole number, or above `MOST`.
+    """
+
+    def __init__(self, build: Callable[[], Network], members: int) -> None:
+        if not (type(members) is int and 0 < members <= MOST and members % 2):
+            raise ValueError(
+                "function.members must be an odd whole number, such as 1 or 3, so that there is a median, and at most "
+                f"{MOST}; got {members!r}."
+            )
+        super().__init__(build() for _ in range(members))
+
+    @property
+    def networks(self) -> list[Network]:
+        """The members."""
+        return [network for network in self if isinstance(network, Network)]
+
+    def compile_kernels(self) -> None:
+        """Train through `torch.compile`, where the networks know how."""
+        for network in self.networks:
+            network.compile_kernels()
+
+
+def median(parts: Sequence[Tensor]) -> Tensor:
+    """The median of an odd number of tensors, entry by entry."""
+    return parts[0] if len(parts) == 1 else torch.stack(list(parts)).median(0).values

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import final
 
 import torch
 from torch import Tensor
 
 from hno.games import Game
-from hno.operators.base import ValueOperator, at_fixed_points, functions
-from hno.operators.deeponet import DeepONet
+from hno.operators.base import FieldFunction, ValueOperator, at_fixed_points, functions
 from hno.operators.inputs import JointEncoding, distinct_types
-from hno.operators.network import Inputs, Network
-from hno.operators.value_gradient import compiled
+from hno.operators.network import Ensemble, Inputs, Network, median
 from hno.types import Points, PotentialField, Types
 
 MOST = 64
@@ -36,9 +35,10 @@ class PotentialOperator(ValueOperator):
         network: builds one network for the sizes of its inputs.
         exact_terminal: W = sum of terminal values + (tau / horizon) N rather than N, so that the boundary condition
             holds exactly; V_i likewise.
+        members: of the ensemble of networks. The branch that is played is that of the median of W.
 
     Raises:
-        ValueError: the game is no potential game, or has too many combinations of sides.
+        ValueError: the game is no potential game, or has too many combinations of sides; or see `Ensemble`.
     """
 
     potential = True
@@ -47,7 +47,9 @@ class PotentialOperator(ValueOperator):
     active: Tensor
     """Whether a label has the branch, (K,)."""
 
-    def __init__(self, game: Game, network: Callable[[Inputs], Network], exact_terminal: bool = True) -> None:
+    def __init__(
+        self, game: Game, network: Callable[[Inputs], Network], exact_terminal: bool = True, members: int = 1
+    ) -> None:
         super().__init__(game)
         pairs = game.players * (game.players - 1) // 2
         if 2**pairs > MOST:
@@ -62,12 +64,11 @@ class PotentialOperator(ValueOperator):
         self.register_buffer("active", torch.ones(len(sides), dtype=torch.bool))
         size = self._sensors((game.type_box.lo + game.type_box.hi).unsqueeze(0) / 2).shape[-1]
         self.encoding = JointEncoding(game, size)
-        self.network = network(self.encoding.sizes)
+        self.networks = Ensemble(lambda: network(self.encoding.sizes), members)
 
     def compile_kernels(self) -> None:
         """Train through `torch.compile`."""
-        if isinstance(self.network, DeepONet):
-            self.network.kernels = compiled()
+        self.networks.compile_kernels()
 
     def set_branches(self, branch: Tensor) -> None:
         """Play those branches only that labels have."""
@@ -75,7 +76,7 @@ class PotentialOperator(ValueOperator):
 
     def value(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
         """V_i of the branch that is played, (B, P)."""
-        branches, players = self._functions(tau, x, theta, self._heads(tau, x, theta))
+        branches, players = self._functions(tau, x, theta, self._heads(tau, x, theta).median(0).values)
         return _chosen(players, branches.argmax(-1))
 
     def value_and_costate(self, tau: Tensor, x: Tensor, theta: Tensor) -> tuple[Tensor, Tensor]:
@@ -84,45 +85,63 @@ class PotentialOperator(ValueOperator):
         def functions(x: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor]]:
             at = tau.unsqueeze(0), x.unsqueeze(0), theta.unsqueeze(0)
             branches, players = self._functions(*at, self._heads(*at))
-            return branches.squeeze(0), (branches.squeeze(0), players.squeeze(0))
+            return branches.squeeze(1), (branches.squeeze(1), players.squeeze(1))
 
         slopes, (branches, players) = self.jacobian(functions, has_aux=True)(x)
-        best = branches.argmax(-1)
-        return _chosen(players, best), _chosen(slopes, best).unsqueeze(0)
+        best = branches.median(0).values.argmax(-1)
+        return _chosen(players.median(0).values, best), _chosen(slopes.median(0).values, best).unsqueeze(0)
 
     def field(self, points: Points, types: Types | None = None) -> PotentialField:
-        """W, its derivatives and V_i, of the branch in `types` or the best one."""
+        """W, its derivatives and V_i, of the branch in `types` or the best one: medians over the members."""
+        return self._field(self.networks.networks, points, types)
+
+    @property
+    def members(self) -> Sequence[FieldFunction]:
+        """The field of every network."""
+        return [functools.partial(self._field, [network]) for network in self.networks.networks]
+
+    def _field(self, networks: Sequence[Network], points: Points, types: Types | None = None) -> PotentialField:
+        """The field of the median of some networks."""
         tau, x, theta = points
         types = types or distinct_types(theta)
         y, sensors = self.encoding(tau, x), self._sensors(types.distinct)
         kinds = 1 + self.game.players
         first = types.which.unsqueeze(-1) * (len(self.sides) * kinds)
-        heads = self.network.values(y, sensors, first + torch.arange(len(self.sides) * kinds, device=y.device))
+        which = first + torch.arange(len(self.sides) * kinds, device=y.device)
+        heads = median([network.values(y, sensors, which) for network in networks])
         branches, players = self._functions(tau, x, theta, heads)
         branch = branches.argmax(-1)
         if types.branch is not None:
             branch = torch.where(types.branch < 0, branch, types.branch)
-        raw, gradient = self.network.value_gradient(y, sensors, first.squeeze(-1) + branch * kinds)
-        value, slope = raw * self.value_scale, self.encoding.time_slope(gradient) * self.value_scale
-        costate = self.encoding.state_slope(gradient, x, self.value_scale)
+        chosen = first.squeeze(-1) + branch * kinds
+        found = [self._derivatives(points, *network.value_gradient(y, sensors, chosen)) for network in networks]
+        value, slope, costate = map(median, zip(*found, strict=True))
         if self.meets_terminal:
-            share = tau / self.game.horizon
-            slope = value / self.game.horizon + share * slope
             with torch.inference_mode(mode=False), torch.enable_grad():
                 at = x.detach().clone().requires_grad_()
                 end = self.game.terminal_value(at).sum(-1)
                 (push,) = torch.autograd.grad(end.sum(), at)
-            value = end.detach() + share * value
-            costate = push.unsqueeze(-3) + share[..., None, None, None] * costate
-        found = PotentialField(value.unsqueeze(-1), slope.unsqueeze(-1), costate, _chosen(players, branch), branches)
-        return at_fixed_points(found, points)
+            value, costate = end.detach() + value, push.unsqueeze(-3) + costate
+        result = PotentialField(value.unsqueeze(-1), slope.unsqueeze(-1), costate, _chosen(players, branch), branches)
+        return at_fixed_points(result, points)
+
+    def _derivatives(self, points: Points, raw: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Value, time derivative and costates of what a network adds to the terminal values."""
+        tau, x, _ = points
+        value, slope = raw * self.value_scale, self.encoding.time_slope(gradient) * self.value_scale
+        costate = self.encoding.state_slope(gradient, x, self.value_scale)
+        if not self.meets_terminal:
+            return value, slope, costate
+        share = tau / self.game.horizon
+        return share * value, value / self.game.horizon + share * slope, share[..., None, None, None] * costate
 
     def _heads(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
-        """Raw network outputs, (B, K (1 + P)), by a pure function."""
+        """Raw outputs of every network, (members, B, K (1 + P)), by a pure function."""
         y = self.encoding(tau, x)
         columns = len(self.sides) * (1 + self.game.players)
         which = torch.arange(len(y) * columns, device=y.device).view(len(y), columns)
-        return self.network.values(y, self._sensors(theta), which)
+        sensors = self._sensors(theta)
+        return torch.stack([network.values(y, sensors, which) for network in self.networks.networks])
 
     def _functions(self, tau: Tensor, x: Tensor, theta: Tensor, heads: Tensor) -> tuple[Tensor, Tensor]:
         """W (B, K), -inf for branches without labels, and V_i (B, K, P) of every branch, from the network's outputs."""

@@ -30,7 +30,7 @@ log = logging.getLogger(__name__)
 
 KEY = "hno"
 """Checkpoint entry that says how to build the operator and where it comes from."""
-FORMAT = 5
+FORMAT = 6
 """Version of that entry."""
 
 

@@ -43,18 +43,14 @@ def registered(monkeypatch: pytest.MonkeyPatch) -> None:
 )
 def test_auto_is_the_potential_of_a_game_that_has_one(game: str, function: str) -> None:
     chosen = train_settings([f"game={game}"]).function
-    members = {"members": 1} if function == "value" else {}
-    assert chosen == {"name": function, "exact_terminal": True, **members}
+    assert chosen == {"name": function, "exact_terminal": True, "members": 3 if game == "drone" else 1}
     assert train_settings([f"game={game}", "function=auto"]).function == chosen
 
 
 def test_options_of_auto_are_those_of_what_it_stands_for() -> None:
-    assert train_settings(["function.exact_terminal=false"]).function == {"name": "potential", "exact_terminal": False}
-    assert train_settings(["game=walkers", "function.members=3"]).function["members"] == 3
-    with pytest.raises(ValueError, match=r"members is no option of a potential.*choose function=value"):
-        train_settings(["function.members=3"])
-    with pytest.raises(ValueError, match=r"function\.members does not exist.*Known: exact_terminal, name\."):
-        train_settings(["function=potential", "+function.members=3"])
+    for game, name in (("narrow_road", "potential"), ("walkers", "value")):
+        given = [f"game={game}", "function.exact_terminal=false", "function.members=3"]
+        assert train_settings(given).function == {"name": name, "exact_terminal": False, "members": 3}
 
 
 @pytest.mark.parametrize("function", ["value", "potential"])

@@ -35,7 +35,7 @@ def potential_operator(game: str | Game, activation: str = "sin", **options: Any
 
 def potential(operator: ValueOperator, points: Points, branch: Tensor | None = None) -> Tensor:
     """W of the best branch or of given ones by the pure function, differentiable in the points."""
-    heads = operator._functions(*points, operator._heads(*points))[0]
+    heads = operator._functions(*points, operator._heads(*points).median(0).values)[0]
     return heads.amax(-1) if branch is None else heads.gather(-1, branch.unsqueeze(-1)).squeeze(-1)
 
 
@@ -143,6 +143,23 @@ def test_torch_transforms_take_the_answer() -> None:
     torch.testing.assert_close(answers.costate, policy.costate(*points), **TIGHT)
     torch.testing.assert_close(answers.control, policy.act(*points), **TIGHT)
     assert policy.costate(*points).shape == (5, 1, 3, 4)
+
+
+def test_an_ensemble_plays_the_branch_of_the_median_and_answers_alike_by_both_ways() -> None:
+    operator = potential_operator("narrow_road", members=3)
+    points = random_points(operator.game, 64)
+    field, members = operator.field(points), [member(points, None) for member in operator.members]
+    branches = torch.stack([member.branches for member in members]).median(0).values
+    torch.testing.assert_close(field.branches, branches, **TIGHT)
+    best = distinct_types(points.theta)._replace(branch=branches.argmax(-1))
+    same = [member(points, best) for member in operator.members]
+    for part in ("value", "dvalue_dtau"):
+        torch.testing.assert_close(
+            getattr(field, part), torch.stack([getattr(one, part) for one in same]).median(0).values, **TIGHT
+        )
+    answers = torch.vmap(Feedback(operator).answer)(*points)
+    torch.testing.assert_close(answers.costate, field.costate, **TIGHT)
+    torch.testing.assert_close(answers.value, field.players, **TIGHT)
 
 
 def test_games_without_a_potential_are_refused() -> None:
