@@ -13,6 +13,7 @@ from torch import Tensor
 from hno.control import Policy, as_policy
 from hno.control.rollout import Disturbance, Player
 from hno.evaluation.closed_loop import TypeRow, collision_table, play
+from hno.evaluation.outcome import numbers_of
 from hno.evaluation.sections import Evaluation
 from hno.games import Game
 from hno.operators import Architecture, Choice
@@ -132,7 +133,8 @@ def evaluated(
     """The same with episodes."""
     disturbance = entries.pop("disturbance", Disturbance())
     found = evaluation_of(game, policy, labels, seen=seen, **entries)
-    return found._replace(played=play(game, found.policy, labels, found.dt, disturbance))
+    played = play(game, found.policy, labels, found.dt, disturbance)
+    return found._replace(played=[numbers_of(game, *one) for one in played])
 
 
 def played_table(

@@ -11,7 +11,7 @@ from omegaconf import DictConfig
 
 from hno.cli.config import read
 from hno.cli.evaluate import check_evaluation, unseen_types
-from hno.cli.logs import check_wandb, quiet_lightning
+from hno.cli.logs import check_wandb
 from hno.cli.settings import TrainSettings
 from hno.data import Collocation, GameData, LabelPlan, make_sampler
 from hno.data.curriculum import Curriculum
@@ -25,6 +25,7 @@ from hno.training.adaptive import Adaptive
 from hno.training.checkpoint import find_checkpoint
 from hno.training.fit import Settings, make_trainer
 from hno.training.optimizers import make_optimizer
+from hno.training.quiet import quiet_lightning
 from hno.training.saving import RESUMED
 
 

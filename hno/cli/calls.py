@@ -11,7 +11,6 @@ from hno.cli import evaluate as evaluation
 from hno.cli.arguments import Arguments, quoted
 from hno.cli.build import check
 from hno.cli.config import compose, for_hydra, groups
-from hno.cli.logs import quiet_lightning
 from hno.cli.results import Results, recorded
 from hno.cli.settings import TrainSettings
 from hno.cli.train import head, train_operator
@@ -47,7 +46,7 @@ def train(
     place = Path(folder)
     place.mkdir(parents=True, exist_ok=True)
     results = Results(place / "results.json", head(checked))
-    with quiet_lightning(), recorded(results):
+    with recorded(results):
         fitted = train_operator(checked, place, results)
     return load_policy(fitted.checkpoint)
 

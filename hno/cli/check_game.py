@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import pkgutil
 import sys
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Any
 
 from hno.cli.arguments import Arguments, UsageError
 from hno.cli.logs import use_threads
-from hno.registry import UnknownNameError
+from hno.registry import UnknownNameError, reason
 
 PREFIX = "game.constants."
 
@@ -23,13 +24,14 @@ def run(given: Arguments) -> int:
     from hno.games.testing import ContractError, check_game
 
     use_threads(1)
-    name, constants = given.words[0], _constants(given.overrides)
+    name, constants, place = given.words[0], _constants(given.overrides), ""
     try:
         game = _class(name)(**constants) if ":" in name else make(name, **constants)
+        place = f" It is in {inspect.getsourcefile(type(game))}."
         check_game(game)
     except Exception as error:  # whatever a file of the user's raises
-        kind = "" if isinstance(error, (ContractError, LookupError)) else f"{type(error).__name__}: "
-        print(f"{name} cannot be used yet: {kind}{error}", file=sys.stderr)
+        said = str(error) if isinstance(error, (ContractError, UnknownNameError)) else reason(error)
+        print(f"{name} cannot be used yet: {said}{place}", file=sys.stderr)
         return 1
     print(
         f"{name} keeps the contract of a game: {game.players} players, {game.state_dim} states and "

@@ -26,8 +26,9 @@ from hno.data.labels import Request, default_cache, labels_for, safe_labels_for
 from hno.evaluation.closed_loop import CollisionTable, play
 from hno.evaluation.comparison import PairedComparison, check_same_game
 from hno.evaluation.conditions import TIES, table_condition
-from hno.evaluation.episodes import EPISODES, episodes
+from hno.evaluation.episodes import EPISODES, episodes, together
 from hno.evaluation.format import title
+from hno.evaluation.outcome import Played, numbers_of
 from hno.evaluation.sections import Evaluation
 from hno.games import Game
 from hno.games.grid import parse_types, quarter_types
@@ -111,7 +112,7 @@ def describe(
     solver = functools.partial(safe_labels_for, clearance=options["clearance"]) if options["safe"] else labels_for
 
     @functools.cache
-    def solve(widen: float, symmetric: bool, ties: bool) -> list[Extremal]:
+    def solve(widen: float, symmetric: bool, ties: bool) -> Sequence[Extremal]:
         starts = min(options["starts"], TIES) if ties else options["starts"]
         kind = starts, options["seed"], "test", widen, symmetric, ties
         requests = [Request(theta, *kind) for theta in types]
@@ -184,20 +185,21 @@ def play_starts(evaluation: Evaluation, results: Results) -> tuple[Evaluation, T
         The evaluation with its labels and episodes, and the rows of its table.
     """
     began, game, folder = time.perf_counter(), evaluation.game, results.path.parent
-    labels, disturbance = list(evaluation.solve(evaluation.condition)), evaluation.condition.disturbance
-    solved = time.perf_counter()
-    played = play(game, evaluation.policy, labels, evaluation.dt, disturbance)
+    labels, disturbance = evaluation.solve(evaluation.condition), evaluation.condition.disturbance
+    solved, played, kept = time.perf_counter(), list[Played](), list[dict[str, Any]]()
+    for label, paths in play(game, evaluation.policy, labels, evaluation.dt, disturbance):
+        played.append(numbers_of(game, label, paths))
+        kept += episodes(evaluation, label, paths)
     found = evaluation._replace(labels=labels, played=played)
     table = CollisionTable().compute(found)
     results.time("test_labels", solved - began)
     results.time("evaluation", time.perf_counter() - solved)
     if results.content["episodes"] is None:
-        kept = episodes(found)
-        write_json(folder / EPISODES, kept)
+        write_json(folder / EPISODES, together(game, kept))
         conditions = {name: found.options[name] for name in ("clearance", "dt", "widen", "noise", "delay")}
         results.update(**conditions, test_seed=disturbance.seed, constraint_unit=game.constraint_unit)
         results.update(table=table, episodes=EPISODES)
-        draw_typical(kept["episodes"], folder / "rollout.png", title(results.content))
+        draw_typical(kept, folder / "rollout.png", title(results.content))
     return found, table
 
 

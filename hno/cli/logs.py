@@ -8,8 +8,7 @@ import os
 import socket
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlparse
@@ -24,12 +23,6 @@ from hno.cli.settings import TrainSettings
 from hno.data.labels import Progress, Report
 
 log = logging.getLogger(__name__)
-EXPECTED = (
-    ".*exists and is not empty",  # results.json is there first, on purpose
-    ".*isinstance.treespec, LeafSpec.",  # Lightning's own, from torch 2.13 on
-    ".*does not have many workers",  # batches are made in memory
-)
-"""Warnings of Lightning that mean nothing here."""
 MODES = ("online", "offline", "disabled", "shared", "dryrun", "run")
 """What W&B takes for WANDB_MODE."""
 
@@ -38,26 +31,10 @@ def send_lightning_to_hydra() -> None:
     """Let Lightning's messages and Python's warnings reach Hydra's handlers, console and file."""
     logging.captureWarnings(True)
     warnings.formatwarning = lambda message, category, *_, **__: f"{category.__name__}: {message}"
-    warnings.filterwarnings("ignore", message="|".join(EXPECTED))
-    logging.getLogger("lightning.pytorch.utilities.rank_zero").addFilter(lambda line: "Tip:" not in line.getMessage())
     for name in ("lightning", "lightning.pytorch", "lightning.fabric"):
         logger = logging.getLogger(name)
         logger.handlers.clear()
         logger.propagate = True
-
-
-@contextmanager
-def quiet_lightning() -> Iterator[None]:
-    """Lightning speaks of what goes wrong only, where a program trains."""
-    logger = logging.getLogger("lightning.pytorch")
-    before = logger.level
-    logger.setLevel(logging.WARNING)
-    try:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message="|".join(EXPECTED))
-            yield
-    finally:
-        logger.setLevel(before)
 
 
 def use_threads(count: int | None) -> None:

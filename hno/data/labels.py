@@ -17,14 +17,14 @@ from torch import Tensor
 
 from hno.data.certificates import CLEARANCE, safe
 from hno.data.folders import POLL, Waiting, check_room
-from hno.data.shards import SHARD, LabelSet
+from hno.data.shards import SHARD, LabelSet, StoredLabels
 from hno.data.store import canonical_json
 from hno.data.ties import APART, HALVINGS, TIE, tie_states
 from hno.games import Game
 from hno.pontryagin.mesh import label_times
 from hno.pontryagin.solve import Solver, solve
 from hno.pontryagin.threads import cores
-from hno.types import Extremal, Status, best_of, of_starts, part
+from hno.types import Status, best_of, of_starts
 
 SOLVER_VERSION = 2
 """Counted up when the solver's results change, which makes cached labels stale."""
@@ -148,7 +148,7 @@ def labels_for(
     settings: Solver = Solver(),
     workers: int | None = None,
     report: Report | None = None,
-) -> tuple[list[Extremal], float]:
+) -> tuple[StoredLabels, float]:
     """Labels of every request, read from the cache or solved and written to it, shard by shard.
 
     Args:
@@ -160,7 +160,7 @@ def labels_for(
         report: called as labels are written.
 
     Returns:
-        One `Extremal` per request, failed rows included, and the seconds spent on solving.
+        One `Extremal` per request, failed rows included, read when it is asked for; the seconds spent on solving.
 
     Raises:
         LabelFileError: a cached file is damaged, and the cache cannot be written to; elsewhere it is moved aside.
@@ -179,8 +179,7 @@ def labels_for(
             report(Progress(done, total, converged))
     for labels in sets:
         labels.write_manifest()
-    found = [labels.read(request.starts) for labels, request in zip(sets, requests, strict=True)]
-    return found, time.perf_counter() - began
+    return StoredLabels(sets, [request.starts for request in requests]), time.perf_counter() - began
 
 
 def label_bytes(game: Game, starts: int) -> int:
@@ -198,7 +197,7 @@ def safe_labels_for(
     report: Report | None = None,
     most: int = 4096,
     clearance: float = CLEARANCE,
-) -> tuple[list[Extremal], float]:
+) -> tuple[StoredLabels, float]:
     """Labels of as many start states as it takes until `starts` of each request are safe.
 
     Args:
@@ -222,9 +221,7 @@ def safe_labels_for(
         masks = [safe(labels, clearance) for labels in found]
         grown = [_enough(*entry, most) for entry in zip(masks, wanted, strict=True)]
         if grown == sizes:
-            return [
-                part(labels, slice(_last(m, n))) for labels, m, n in zip(found, masks, wanted, strict=True)
-            ], seconds
+            return StoredLabels(found.sets, list(map(_last, masks, wanted))), seconds
         sizes = grown
 
 

@@ -7,7 +7,7 @@ import json
 import logging
 import os
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from importlib.metadata import version
@@ -210,6 +210,26 @@ class LabelSet:
 
     def _lock(self) -> AbstractContextManager[None]:
         return locked(self.folder / ".lock")
+
+
+class StoredLabels(Sequence[Extremal]):
+    """Labels of several sets, each read whenever it is asked for: all of them need not fit into memory.
+
+    Args:
+        sets: where they are.
+        starts: how many start states of each.
+    """
+
+    def __init__(self, sets: Sequence[LabelSet], starts: Sequence[int]) -> None:
+        self.sets, self.starts = sets, starts
+
+    def __len__(self) -> int:
+        """How many sets."""
+        return len(self.sets)
+
+    def __getitem__(self, place: Any) -> Any:
+        """The labels of a set."""
+        return self.sets[place].read(self.starts[place])
 
 
 def _signed(content: Mapping[str, Any]) -> str:

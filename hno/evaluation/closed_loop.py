@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -12,11 +12,15 @@ from hno.control import Feedback
 from hno.control.rollout import Disturbance, Player, rollout
 from hno.data.rows import rows_of
 from hno.evaluation import format as text
+from hno.evaluation.metrics import in_batches
 from hno.evaluation.outcome import Outcome, outcome, pooled
 from hno.evaluation.sections import COUNTS, Column, Evaluation, ModelSection, Type, sections
 from hno.games import Game
 from hno.games.base import own_costate
 from hno.types import Extremal, PotentialField, Status, Trajectory
+
+AT_ONCE = 4096
+"""Starts that are played together, at most, but for those of one type: an episode takes some 10 kB."""
 
 
 class TypeRow(NamedTuple):
@@ -42,27 +46,48 @@ class TypeRow(NamedTuple):
 
 
 def play(
-    game: Game, policy: Player, labels: Sequence[Extremal], dt: float, disturbance: Disturbance = Disturbance()
-) -> list[Trajectory]:
-    """Episodes from the start states of labels, one set per set of labels, with controls held for `dt`, s."""
-    starts = torch.cat([found.x[:, 0] for found in labels]).float()
-    types = torch.cat([found.theta for found in labels]).float()
-    played = rollout(game, policy, starts, types, dt, disturbance=disturbance)
-    sizes = [len(found.status) for found in labels]
-    columns = zip(*(column.split(sizes) for column in played[1:]), strict=True)
-    return [Trajectory(played.t, *part) for part in columns]
+    game: Game,
+    policy: Player,
+    labels: Iterable[Extremal],
+    dt: float,
+    disturbance: Disturbance = Disturbance(),
+    at_once: float = AT_ONCE,
+) -> Iterator[tuple[Extremal, Trajectory]]:
+    """Sets of labels, each with the episodes from its start states, with controls held for `dt`, s.
+
+    The paths of all need not fit into memory: of sets up to `at_once` starts, which are played together, or of one.
+    """
+    for some in _gathered(labels, at_once):
+        starts = torch.cat([found.x[:, 0] for found in some]).float()
+        types = torch.cat([found.theta for found in some]).float()
+        played = rollout(game, policy, starts, types, dt, disturbance=disturbance)
+        columns = zip(*(column.split([len(found.status) for found in some]) for column in played[1:]), strict=True)
+        yield from ((found, Trajectory(played.t, *paths)) for found, paths in zip(some, columns, strict=True))
+
+
+def _gathered(labels: Iterable[Extremal], most: float) -> Iterator[list[Extremal]]:
+    """Sets that have at most so many starts together, or one that has more."""
+    some, count = list[Extremal](), 0
+    for found in labels:
+        if some and count + len(found.status) > most:
+            yield some
+            some, count = [], 0
+        some.append(found)
+        count += len(found.status)
+    if some:
+        yield some
 
 
 def collision_table(evaluation: Evaluation) -> list[TypeRow]:
     """What came of the episodes from the starts of labels, and the errors along these, type by type."""
-    game, box, rows = evaluation.game, evaluation.game.type_box, list[TypeRow]()
+    box, rows = evaluation.game.type_box, list[TypeRow]()
     known = [tuple(map(float, types)) for types in evaluation.seen]
     for found, played in zip(evaluation.labels, evaluation.played, strict=True):
         theta = tuple(found.theta[0].tolist())
         extrapolated = not bool(box.contains(found.theta[0].to(box.lo)))
         ranges = [(min(column), max(column)) for column in zip(*known, strict=True)]
         outside = any(not low <= own <= high for own, (low, high) in zip(theta, ranges, strict=False))
-        came, errors = outcome(game, found, played, evaluation.clearance), label_errors(evaluation.policy, found)
+        came, errors = outcome(played, evaluation.clearance), label_errors(evaluation.policy, found)
         rows.append(TypeRow(theta, theta in known, extrapolated, outside, came, *errors))
     return rows
 
@@ -77,7 +102,7 @@ def label_errors(policy: Feedback, found: Extremal) -> tuple[float | None, float
         return None, None
     points, labels, _ = rows_of(policy.game, [found])
     assert labels is not None
-    predicted = policy.operator.field(points)
+    predicted = in_batches(policy.operator.field, points)
     if isinstance(predicted, PotentialField):
         own = own_costate(labels.costate).unsqueeze(-3)
         pairs = (predicted.players, labels.value), (predicted.costate, own)

@@ -142,5 +142,4 @@ def _names(content: Mapping[str, Any]) -> list[str]:
 
 def _collisions(evaluation: Evaluation) -> list[Tensor]:
     """Whether the model collides, safe start by safe start, one (safe starts,) per type."""
-    pairs = zip(evaluation.labels, evaluation.played, strict=True)
-    return [played.collided[safe(labels, evaluation.clearance)] for labels, played in pairs]
+    return [played.collided[safe(played.label, evaluation.clearance)] for played in evaluation.played]

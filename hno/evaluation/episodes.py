@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -24,23 +25,25 @@ TURN = 0.5
 """Angle that two players must turn around each other, rad, before it counts which way they do so."""
 
 
-def episodes(evaluation: Evaluation) -> dict[str, Any]:
-    """The worst and the typical episode of every type, among the starts that count.
+def episodes(evaluation: Evaluation, found: Extremal, played: Trajectory) -> list[dict[str, Any]]:
+    """The worst and the typical episode of one type, among the starts that count.
 
     Returns:
         JSON content: positions of all players over time, the distance below which it is a collision where the
         constraint is one, the branch of a potential that is played, the path of the equilibrium from the same start and
-        whether players pass on another side than there, costs. Types without a start that counts are left out.
+        whether players pass on another side than there, costs. Nothing without a start that counts.
     """
-    game, played = evaluation.game, evaluation.played
-    kept = []
-    for found, part in zip(evaluation.labels, played, strict=True):
-        counted = safe(found, evaluation.clearance).nonzero().squeeze(-1)
-        if len(counted):
-            near = part.clearance[counted]
-            chosen = {"worst": near.argmin(), "typical": near.argsort()[len(near) // 2]}  # NaN is the smallest
-            kept += [{"kind": kind, **_episode(evaluation, part, found, int(counted[k]))} for kind, k in chosen.items()]
-    dimensions = game.positions(played[0].x[:1, 0]).shape[-1]
+    counted = safe(found, evaluation.clearance).nonzero().squeeze(-1)
+    if len(counted) == 0:
+        return []
+    near = played.clearance[counted]
+    chosen = {"worst": near.argmin(), "typical": near.argsort()[len(near) // 2]}  # NaN is the smallest
+    return [{"kind": kind, **_episode(evaluation, played, found, int(counted[k]))} for kind, k in chosen.items()]
+
+
+def together(game: Game, kept: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """JSON content of a file of episodes, with what is common to all of them."""
+    dimensions = game.positions(game.state_box.lo).shape[-1]
     units = {"players": game.players, "dimensions": dimensions, "constraint_unit": game.constraint_unit}
     return {**units, "episodes": kept}
 

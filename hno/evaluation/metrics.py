@@ -2,13 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from scipy.special import betaincinv
 from torch import Tensor
 
 from hno.games import Box
+from hno.types import Points
+
+BATCH = 16_384
+"""Rows that are computed at once, at most: derivatives of a value function take some 10 kB a row."""
+
+
+@torch.no_grad()
+def in_batches(compute: Callable[[Points], tuple[Tensor, ...]], points: Points) -> Any:
+    """What is computed of points, (B, ...) each, batch by batch."""
+    columns = zip(*(column.split(BATCH) for column in points), strict=True)
+    found = [compute(Points(*batch)) for batch in columns]
+    whole = map(torch.cat, zip(*found, strict=True))
+    return type(found[0])(*whole) if hasattr(found[0], "_fields") else tuple(whole)
 
 
 def quantiles(values: Tensor, shares: Sequence[float]) -> Tensor:
@@ -22,10 +36,10 @@ def quantiles(values: Tensor, shares: Sequence[float]) -> Tensor:
     return values.double().quantile(at, 0, interpolation="lower")
 
 
-def saturated_share(u: Tensor, box: Box, tolerance: float = 1e-4) -> float | None:
-    """Share of controls (B, K, P, m) within `tolerance` widths of a bound of their box; None without controls."""
+def saturated_share(u: Tensor, box: Box, tolerance: float = 1e-4) -> Tensor:
+    """Share of controls (B, K, P, m) within `tolerance` widths of a bound of their box, episode by episode, (B,)."""
     inside = torch.minimum(u - box.lo, box.hi - u) / box.width
-    return float((inside <= tolerance).double().mean()) if inside.numel() else None
+    return (inside <= tolerance).double().flatten(1).mean(1)
 
 
 def clopper_pearson(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float] | None:

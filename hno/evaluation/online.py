@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -16,7 +17,7 @@ from hno.control.rollout import Player, rollout
 from hno.data.certificates import safe
 from hno.evaluation import format as text
 from hno.evaluation.closed_loop import play
-from hno.evaluation.outcome import Outcome, outcomes
+from hno.evaluation.outcome import Outcome, numbers_of, outcomes
 from hno.evaluation.sections import COUNTS, Column, Evaluation, ModelSection, sections
 from hno.games import Game
 from hno.types import Extremal, part
@@ -50,7 +51,8 @@ def compare(evaluation: Evaluation, labels: Sequence[Extremal], interval: int = 
     game, dt, disturbance = evaluation.game, evaluation.dt, evaluation.condition.disturbance
     solver, found = RecedingHorizon(game, interval), dict[str, list[Outcome]]()
     for name, controller in (("policy", evaluation.policy), ("solver", solver)):
-        by_type, whole = outcomes(game, labels, play(game, controller, labels, dt, disturbance), evaluation.clearance)
+        played = play(game, controller, labels, dt, disturbance, at_once=math.inf)  # for its counts
+        by_type, whole = outcomes([numbers_of(game, *one) for one in played], evaluation.clearance)
         found[name] = [*by_type, whole]
     rows = torch.arange(len(solver.solves))
     sets = [*rows.split([len(one.status) for one in labels]), rows]

@@ -64,11 +64,45 @@ class Outcome(NamedTuple):
     """Episodes that do not stay finite; they count as collisions."""
 
 
-def outcome(game: Game, labels: Extremal, played: Trajectory, clearance: float) -> Outcome:
-    """What came of episodes that were played from the starts of labels, B rows of each.
+class Played(NamedTuple):
+    """What is kept of B episodes: numbers without paths, which would not fit into memory for very many."""
+
+    label: Extremal
+    """The labels of their starts, without what comes after the first node."""
+    value: Tensor
+    """Minus the cost of each player, shape (B, P)."""
+    distance: Tensor
+    """Smallest distance between players, m, shape (B,)."""
+    collided: Tensor
+    """Whether they collide, shape (B,)."""
+    lost: Tensor
+    """Whether they do not stay finite, shape (B,)."""
+    saturated: Tensor
+    """Share of controls on a bound of their box, shape (B,)."""
+    outside: Tensor
+    """Share of steps at which a player is outside the PDE box, shape (B,)."""
+
+
+def numbers_of(game: Game, label: Extremal, paths: Trajectory) -> Played:
+    """What is kept of episodes that were played from the starts of labels, B rows of each."""
+    kept = {name: getattr(label, name)[:, :1].clone() for name in ("x", "costate", "u", "value", "potential")}
+    return Played(
+        label._replace(t=label.t[:1], **kept),
+        paths.value,
+        paths.distance,
+        paths.collided,
+        paths.lost,
+        saturated_share(paths.u, game.control_box),
+        outside(game, paths.x[:, :-1]).double().mean(1),
+    )
+
+
+def outcome(played: Played, clearance: float) -> Outcome:
+    """What came of episodes.
 
     A start counts if its label keeps the clearance, which is in the unit of the game's constraint.
     """
+    labels = played.label
     counted, near = safe(labels, clearance), marginal(labels, clearance)
     count, collisions = int(counted.sum()), int((played.collided & counted).sum())
     own = (labels.value[:, 0] - played.value.double())[counted]
@@ -89,20 +123,17 @@ def outcome(game: Game, labels: Extremal, played: Trajectory, clearance: float) 
         largest_excess_cost=_finite(joint[1]),
         median_excess_costs=_finite(quantiles(own, (0.5,))[0]),
         median_label_cost=_finite(quantiles(labels.cost[counted], (0.5,))[0]),
-        saturated=saturated_share(played.u[counted], game.control_box),
-        outside=float(outside(game, played.x[counted, :-1]).float().mean()) if count else None,
+        saturated=float(played.saturated[counted].mean()) if count else None,
+        outside=float(played.outside[counted].mean()) if count else None,
         lost=int((played.lost & counted).sum()),
     )
 
 
-def outcomes(
-    game: Game, labels: Sequence[Extremal], played: Sequence[Trajectory], clearance: float
-) -> tuple[list[Outcome], Outcome]:
+def outcomes(played: Sequence[Played], clearance: float) -> tuple[list[Outcome], Outcome]:
     """What came of the episodes of every type, and of all of them together."""
-    columns = zip(*(episodes[1:] for episodes in played), strict=True)
-    whole = Trajectory(played[0].t, *(torch.cat(column) for column in columns))
-    by_type = [outcome(game, *sets, clearance) for sets in zip(labels, played, strict=True)]
-    return by_type, outcome(game, join(labels), whole, clearance)
+    labels, *columns = zip(*played, strict=True)
+    whole = Played(join(labels), *map(torch.cat, columns))
+    return [outcome(one, clearance) for one in played], outcome(whole, clearance)
 
 
 def _finite(values: Tensor) -> Any:

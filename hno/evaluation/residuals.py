@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -12,6 +13,7 @@ from torch import Tensor
 from hno.data.rows import rows_of
 from hno.data.sources import Known, Pool, make_sampler, sample_points
 from hno.evaluation import format as text
+from hno.evaluation.metrics import in_batches
 from hno.evaluation.sections import Column, Evaluation, ModelSection, sections
 from hno.games import Game
 from hno.losses.hji import HJIResidual
@@ -100,7 +102,8 @@ def _means(operator: ValueOperator, where: Points, bins: int) -> tuple[Any, ...]
     """The fields of a `ResidualRow` after `points`."""
     horizon = operator.game.horizon
     place = (where.tau / horizon * bins).long().clamp(0, bins - 1)
-    residual, scale = hji(operator, where) if len(where.tau) > 0 else (where.theta, where.theta)
+    nothing = where.theta, where.theta
+    residual, scale = in_batches(functools.partial(hji, operator), where) if len(where.tau) > 0 else nothing
     inside = [place == k for k in range(bins)]
     kinds = residual, residual / scale
     return (

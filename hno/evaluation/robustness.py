@@ -11,7 +11,7 @@ from hno.data.ties import TIE, TooFewTiesError
 from hno.evaluation import format as text
 from hno.evaluation.closed_loop import play
 from hno.evaluation.conditions import TIES, Condition, read_conditions
-from hno.evaluation.outcome import outcomes, pooled
+from hno.evaluation.outcome import numbers_of, outcomes, pooled
 from hno.evaluation.sections import COUNTS, Column, Evaluation, ModelSection, sections
 
 MEANING = {
@@ -55,7 +55,7 @@ class Robustness(ModelSection):
                 log.warning("Condition %s is left out: %s", condition.name, error)
                 continue
             played = play(game, evaluation.policy, labels, evaluation.dt, condition.disturbance)
-            by_type, whole = outcomes(game, labels, played, evaluation.clearance)
+            by_type, whole = outcomes([numbers_of(game, *one) for one in played], evaluation.clearance)
             types = [
                 {"theta": theta, "safe_starts": one.safe_starts, "collisions": one.collisions}
                 for theta, one in zip(evaluation.types, by_type, strict=True)

@@ -13,9 +13,10 @@ from typing import Any, ClassVar, NamedTuple
 from hno.control import Feedback
 from hno.evaluation import format as text
 from hno.evaluation.conditions import Condition, table_condition
+from hno.evaluation.outcome import Played
 from hno.games import Game
 from hno.registry import Registry
-from hno.types import Extremal, Trajectory
+from hno.types import Extremal
 
 sections: Registry[Section] = Registry("section", "hno.evaluation", base="hno.evaluation.sections:Section")
 Type = tuple[float, ...]
@@ -70,8 +71,8 @@ class Evaluation(NamedTuple):
     """Labels of the starts of a condition, one set per type."""
     labels: Sequence[Extremal] = ()
     """Labels of the starts, one set per type; empty before they are solved."""
-    played: Sequence[Trajectory] = ()
-    """Episodes from these starts, one set per type."""
+    played: Sequence[Played] = ()
+    """What came of the episodes from these starts, one set per type."""
 
     @property
     def game(self) -> Game:

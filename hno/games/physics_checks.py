@@ -33,6 +33,8 @@ METHODS = {
     "positions": ("x", "players"),
 }
 """What a game may state: arguments, and the shape of the result after the batch shape, up to a free last axis."""
+AFFINE = {"drift": ("x", "players state_dim"), "affine_input": ("u", "players control_dim")}
+"""What a `ControlAffineGame` may state besides: a wrong shape would be broadcast in its dynamics."""
 
 
 class ContractError(AssertionError):
@@ -70,8 +72,9 @@ def points(game: Game, shape: tuple[int, ...], dtype: torch.dtype, scale: float 
 
 
 def call(game: Game, name: str, at: Point) -> Tensor:
-    """What one of `METHODS` answers."""
-    answer: Tensor = getattr(game, name)(*(getattr(at, argument) for argument in METHODS[name][0].split()))
+    """What one of `METHODS` or `AFFINE` answers."""
+    arguments, _ = (METHODS | AFFINE)[name]
+    answer: Tensor = getattr(game, name)(*(getattr(at, argument) for argument in arguments.split()))
     return answer
 
 
@@ -185,20 +188,27 @@ def _check_starts(game: Game) -> None:
 
 
 def _check_signs(game: Game) -> None:
-    """Far away, rewards are low and costs are high; of a game in which the opposite holds for all, a sign is wrong."""
+    """A reward that grows with the square of the distance in every direction, for all players, is a cost.
+
+    One that grows with the distance itself may be meant, such as that for the way travelled: effort grows faster.
+    """
     at = points(game, (256,), torch.float64)
     centre = ((game.state_box.lo + game.state_box.hi) / 2).expand_as(at.x)
-    away, theta = 20 * (at.x - centre), game.type_box.lo.expand_as(at.theta)
+    away, theta = at.x - centre, game.type_box.lo.expand_as(at.theta)
 
-    def bend(name: str) -> Tensor:
-        places = (centre + away, centre - away, centre)
+    def growth(name: str, widths: float) -> Tensor:
+        """Above the centre, so far away on both sides of it, for each player."""
+        places = (centre + widths * away, centre - widths * away, centre)
         one, other, middle = (call(game, name, at._replace(x=x, theta=theta)) for x in places)
         return (one + other - 2 * middle).mean(0) / (1e-6 + middle.abs().amax())
 
     remedy = "Players maximise V = -J: terminal_value is the reward -g, state_cost a cost."
-    grows, falls = bool((bend("terminal_value") > 1e-3).all()), bool((bend("state_cost") < -1e-3).all())
-    require(not grows, "a terminal_value that is a reward", "one that grows without bound for all players", remedy)
-    require(not falls, "a state_cost that is a cost", "one that falls without bound for all players", remedy)
+    for name, sign, kind in (("terminal_value", 1, "a reward"), ("state_cost", -1, "a cost")):
+        near, far = (sign * growth(name, widths) for widths in (20.0, 40.0))
+        got = f"one that {'grows' if sign > 0 else 'falls'} without bound for all players"
+        if bool((near > 1e-3).all()):
+            require(not bool((far > 3 * near).all()), f"a {name} that is {kind}", got, remedy)  # 4 for squares
+            warnings.warn(f"{name} is {got}. {remedy} If that is meant, all is well.", stacklevel=3)
 
 
 def _check_potential(game: Game) -> None:

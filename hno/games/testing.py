@@ -7,8 +7,10 @@ import copy
 import torch
 from torch import Tensor
 
+from hno.games.affine import ControlAffineGame
 from hno.games.base import REQUIRED, Game
 from hno.games.physics_checks import (
+    AFFINE,
     METHODS,
     ContractError,
     Point,
@@ -38,6 +40,8 @@ def check_game(game: Game) -> None:
         for check_dtype in (_check_outputs, _check_derivatives, check_control_box):
             check_dtype(game.to(dtype), dtype)
     check_physics(game)
+    _check_rows(game)
+    _check_gradients(game)
 
 
 def _check_attributes(game: Game) -> None:
@@ -74,9 +78,9 @@ def _check_places(game: Game) -> None:
 
 
 def _check_outputs(game: Game, dtype: torch.dtype) -> None:
-    for shape in ((), (2,), (2, 3)):
+    for shape in ((), (game.players + 1,), (game.players + 1, game.players + 2)):  # as many rows as players would hide
         at = points(game, shape, dtype)
-        for name in METHODS:
+        for name in _stated(game):
             try:
                 output = call(game, name, at)
             except (RuntimeError, TypeError, ValueError, IndexError) as error:
@@ -88,11 +92,44 @@ def _check_outputs(game: Game, dtype: torch.dtype) -> None:
             _require_output(game, name, output, shape, dtype)
 
 
+def _stated(game: Game) -> list[str]:
+    return [*METHODS, *(AFFINE if isinstance(game, ControlAffineGame) else ())]
+
+
+def _check_rows(game: Game) -> None:
+    """Every row of a batch is answered by itself, in float64."""
+    at = points(game, (game.players + 1,), torch.float64)
+    for name in METHODS:
+        whole = call(game, name, at)
+        each = torch.stack([call(game, name, Point(*(part[row] for part in at))) for row in range(len(whole))])
+        gap = float((whole - each).abs().max() / (1 + whole.abs().max()))
+        remedy = "Index the last axes (x[..., i, :]): the first ones are the batch."
+        require(gap <= 1e-9, f"{name} to answer each row of a batch as if alone", f"{gap:.3g} off", remedy)
+
+
+def _check_gradients(game: Game) -> None:
+    """Derivatives in states, controls and costates are those of central differences along one direction, in float64."""
+    at, to = (points(game, (64,), torch.float64, seed=seed) for seed in (0, 1))
+    way = Point(*(end - start for start, end in zip(at, to, strict=True)))._replace(theta=0 * at.theta)
+    remedy = "No detach, item or numpy in a game; a backward of your own must be the derivative of its forward."
+    for name in (name for name in METHODS if name != "sensors"):
+        ends = [Point(*(start + step * part for start, part in zip(at, way, strict=True))) for step in (1e-6, -1e-6)]
+        after, before = (call(game, name, end) for end in ends)
+        weight = torch.linspace(1, 2, after.numel(), dtype=after.dtype).view_as(after)
+        measured = (weight * (after - before)).reshape(len(after), -1).sum(1) / 2e-6
+        inputs = Point(*(part.clone().requires_grad_() for part in at))
+        slopes = zip(_gradients(call(game, name, inputs), inputs), way, strict=False)  # none of a constant
+        stated = sum(((slope * part).flatten(1).sum(1) for slope, part in slopes), torch.zeros_like(measured))
+        wrong = (stated - measured).abs() > 1e-4 * measured.abs() + 1e-6 * (measured.abs().max() + after.abs().max())
+        got = f"{stated[wrong][:1].tolist()} for {measured[wrong][:1].tolist()}"
+        require(not bool(wrong.any()), f"derivatives of {name} that are those of its values", got, remedy)
+
+
 def _require_output(game: Game, name: str, output: Tensor, batch: tuple[int, ...], dtype: torch.dtype) -> None:
     last = output.shape[-1] if output.dim() > 0 else 0
     some = (max(1, last),)
     free = {"sensors": some, "constraint": some, "positions": (3 if last == 3 else 2,)}.get(name, ())
-    shape = (*batch, *(getattr(game, size) for size in METHODS[name][1].split()), *free)
+    shape = (*batch, *(getattr(game, size) for size in (METHODS | AFFINE)[name][1].split()), *free)
     remedy = "Index the last axes (x[..., i, :]) and stack on them; see hno.types for the shapes."
     require(output.shape == shape, f"{name} of shape {shape}", tuple(output.shape), remedy)
     remedy = "Register constant tensors as buffers and build new ones with the dtype of an argument."

@@ -25,6 +25,7 @@ from hno.training.divergence import StopOnDivergence
 from hno.training.module import TrainingModule
 from hno.training.optimizers import make_optimizer
 from hno.training.polish import polish
+from hno.training.quiet import quiet_lightning
 from hno.training.saving import BEST, LAST, UNFIT, CheckpointError, CheckpointFiles, read_content, reason, remove_drafts
 from hno.training.validation import ClosedLoopValidation, Later, Score
 from hno.types import Extremal
@@ -92,6 +93,7 @@ class Fitted(NamedTuple):
     """Time spent on training, on validation and on labels that were added, if any, s."""
 
 
+@quiet_lightning()
 def fit(
     operator: ValueOperator,
     objective: Objective,

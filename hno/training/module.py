@@ -38,15 +38,23 @@ class TrainingModule(L.LightningModule):
     ) -> None:
         super().__init__()
         self.operator, self.objective, self.optimizer, self.record = operator, objective, optimizer, record or {}
-        self.began = False
+        self.began = self.stepped = False
         self.terms = objective.used(exact_terminal=operator.meets_terminal)
         self.streams = objective.streams(exact_terminal=operator.meets_terminal)
         self.value_error = WeightedMeanAbsolutePercentageError()
         self.costate_error = WeightedMeanAbsolutePercentageError()
 
     def on_train_start(self) -> None:
-        """From here on a checkpoint to go on from has been restored."""
+        """A checkpoint to go on from has been restored, but whether the optimiser can use its state shows in a step."""
         self.began = True
+
+    def on_before_optimizer_step(self, optimizer: Any) -> None:
+        """Losses and gradients are there."""
+        self.began = self.stepped
+
+    def on_train_batch_end(self, outputs: Any, batch: Batch, batch_idx: int) -> None:
+        """All that was restored is of use."""
+        self.began = self.stepped = True
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Weighted sum of the terms whose stream is in the batch; the others are logged as NaN."""

@@ -1,17 +1,25 @@
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Iterator, Sequence
 
 import pytest
 import torch
 from torch import Tensor
 
 from hno.cli.sections import show
+from hno.control import Feedback
 from hno.control.rollout import Disturbance, rollout
-from hno.evaluation.closed_loop import CollisionTable, TypeRow, verdict
+from hno.data.rows import rows_of
+from hno.evaluation import metrics
+from hno.evaluation.closed_loop import CollisionTable, TypeRow, label_errors, play, verdict
+from hno.evaluation.metrics import in_batches
+from hno.evaluation.residuals import hji
+from hno.games import make
 from hno.games.base import own_costate
 from hno.types import Extremal, Field, Points, PotentialField, Status
 from tests.fakes import fake_labels, played_table
+from tests.operators.conftest import small_operator
 from tests.walkers import Walkers
 
 GOOD, BAD = Status.CONVERGED, Status.STALLED
@@ -80,6 +88,40 @@ def test_rows_keep_their_type_and_order() -> None:
     assert [row.theta for row in rows] == [(1.0, 1.0), (4.0, 4.0), (0.5, 0.5)]
     assert [row.outcome.starts for row in rows] == [3, 1, 2]
     assert [row.seen for row in rows] == [False, True, False]
+
+
+def test_episodes_are_the_same_however_many_are_played_together() -> None:
+    sets = [labelled([0.05, 0.3, 0.9][:n], [0.5] * n, theta=theta) for n, theta in ((3, 1.0), (2, 4.0), (1, 0.5))]
+    together = list(play(Walkers(), straight, sets, 0.02))
+    for most in (1, 3, 5):
+        for (label, paths), (same, other) in zip(
+            together, play(Walkers(), straight, sets, 0.02, at_once=most), strict=True
+        ):
+            assert label is same
+            assert all(map(torch.equal, paths, other))
+
+
+def test_only_the_labels_of_what_is_played_together_are_read() -> None:
+    read = list[int]()
+
+    def sets() -> Iterator[Extremal]:
+        for number in range(5):
+            read.append(number)
+            yield labelled([0.9] * 3, [0.5] * 3)
+
+    playing = play(Walkers(), straight, sets(), 0.02, at_once=6)
+    next(playing)
+    assert read == [0, 1, 2]  # the third one does not fit
+
+
+def test_errors_and_residuals_are_the_same_in_small_batches(monkeypatch: pytest.MonkeyPatch) -> None:
+    operator, found = small_operator(), fake_labels(make("narrow_road"), (2.0, 3.0), 3)
+    points = rows_of(operator.game, [found]).points
+    errors, residuals = label_errors(Feedback(operator), found), hji(operator, points)
+    monkeypatch.setattr(metrics, "BATCH", 10)
+    assert label_errors(Feedback(operator), found) == pytest.approx(errors, rel=1e-5)
+    for whole, parts in zip(residuals, in_batches(functools.partial(hji, operator), points), strict=True):
+        torch.testing.assert_close(whole, parts, rtol=1e-4, atol=1e-4)
 
 
 def test_collision_radius_is_that_of_the_rows_type() -> None:

@@ -1,17 +1,21 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
-from hno.evaluation.episodes import FRAMES, episodes
-from hno.evaluation.outcome import outcome
-from hno.games import make
+from hno.control.rollout import Player
+from hno.evaluation.closed_loop import play
+from hno.evaluation.episodes import FRAMES, episodes, together
+from hno.evaluation.outcome import numbers_of, outcome
+from hno.games import Game, make
 from hno.games.kinematics import separation
-from hno.types import Extremal, Points, PotentialField
-from tests.fakes import evaluated, fake_labels
+from hno.types import Extremal, Points, PotentialField, Trajectory
+from tests.fakes import evaluation_of, fake_labels
 from tests.lq import LinearQuadratic
 from tests.walkers import Walkers
 
@@ -19,6 +23,15 @@ from tests.walkers import Walkers
 def straight(tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
     """Walk along x at 4 m/s: walkers who start at the same height miss each other by twice that."""
     return torch.tensor([4.0, 0.0]).expand(len(x), 2, 2)
+
+
+def kept_of(
+    game: Game, policy: Player, labels: Sequence[Extremal], change: Callable[..., Any] = zip, **entries: Any
+) -> dict[str, Any]:
+    """The file of the episodes from the starts of labels, whose labels and paths are changed before."""
+    evaluation = evaluation_of(game, policy, labels, **entries)
+    found, paths = zip(*play(game, evaluation.policy, labels, evaluation.dt), strict=True)
+    return together(game, [one for pair in change(found, paths) for one in episodes(evaluation, *pair)])
 
 
 def labelled(heights: list[float], clearance: list[float], theta: float) -> Extremal:
@@ -39,7 +52,7 @@ def sets() -> list[Extremal]:
 def test_the_worst_and_the_typical_start_that_count_are_kept(sets: list[Extremal]) -> None:
     """Distances are 1.8, 0.8, 0.1, 1.0 and 1.6, 0.7, 1.4; the radius of a type is 0.2 + 0.2 theta."""
     game = Walkers()
-    kept = episodes(evaluated(game, straight, sets))
+    kept = kept_of(game, straight, sets)
     assert (kept["players"], kept["dimensions"]) == (2, 2)
     found = [(e["theta"][0], e["kind"], e["distance"], e["collided"]) for e in kept["episodes"]]
     assert found == [
@@ -53,19 +66,17 @@ def test_the_worst_and_the_typical_start_that_count_are_kept(sets: list[Extremal
 
 def test_an_episode_shows_where_players_go_and_where_the_equilibrium_goes(sets: list[Extremal]) -> None:
     game = Walkers()
-    evaluation = evaluated(game, straight, sets)
-    played, episode = evaluation.played, episodes(evaluation)["episodes"][0]
+    _, played = next(play(game, straight, sets, 0.02))
+    episode = kept_of(game, straight, sets)["episodes"][0]
     frames = len(episode["t"])
     assert FRAMES / 2 < frames <= FRAMES + 2
     kept = separation(torch.tensor(episode["positions"])).amin(-1)
-    assert float(kept.min()) == pytest.approx(float(separation(game.positions(played[0].x[3])).min()), abs=2e-3)
+    assert float(kept.min()) == pytest.approx(float(separation(game.positions(played.x[3])).min()), abs=2e-3)
     assert (episode["t"][0], episode["t"][-1]) == (0.0, pytest.approx(game.horizon))
     for name in ("positions", "label_positions"):
         assert torch.tensor(episode[name]).shape == (frames, 2, 2)
-    torch.testing.assert_close(
-        torch.tensor(episode["positions"][0]), game.positions(played[0].x[3, 0]), atol=1e-3, rtol=0
-    )
-    assert episode["cost"] == pytest.approx(-float(played[0].value[3].sum()), abs=1e-3)
+    torch.testing.assert_close(torch.tensor(episode["positions"][0]), game.positions(played.x[3, 0]), atol=1e-3, rtol=0)
+    assert episode["cost"] == pytest.approx(-float(played.value[3].sum()), abs=1e-3)
     assert episode["label_cost"] == pytest.approx(-float(sets[0].value[3, 0].sum()), abs=1e-3)
     middle = sets[0].x[3].float()
     ends = game.positions(middle)[[0, -1]]
@@ -80,9 +91,9 @@ def two_branches(points: Points) -> PotentialField:
 
 
 def test_the_branch_that_is_played_is_kept_at_every_time(sets: list[Extremal]) -> None:
-    for episode in episodes(evaluated(Walkers(), straight, sets, field=two_branches))["episodes"]:
+    for episode in kept_of(Walkers(), straight, sets, field=two_branches)["episodes"]:
         assert episode["branch"] == [int(t < Walkers.horizon / 2) for t in episode["t"]]
-    assert all(episode["branch"] is None for episode in episodes(evaluated(Walkers(), straight, sets))["episodes"])
+    assert all(episode["branch"] is None for episode in kept_of(Walkers(), straight, sets)["episodes"])
 
 
 @pytest.mark.parametrize(
@@ -99,15 +110,18 @@ def test_players_who_pass_on_another_side_than_the_equilibrium_are_marked(
     x[:, 0] = label.x[:, 0]
     x[:, 0, :, 1] = way
     label, start = label._replace(x=x), label
-    evaluation = evaluated(Walkers(), straight, [start])._replace(labels=[label])
-    assert [one["other_side"] for one in episodes(evaluation)["episodes"]] == [other_side] * 2
+    kept = kept_of(Walkers(), straight, [start], lambda found, paths: zip([label], paths, strict=True))
+    assert [one["other_side"] for one in kept["episodes"]] == [other_side] * 2
 
 
 def test_a_broken_episode_is_the_worst(sets: list[Extremal]) -> None:
     """What is not finite counts as a collision, and stays readable JSON once the writer has replaced it."""
-    evaluation = evaluated(Walkers(), straight, sets)
-    evaluation.played[0].clearance[1] = torch.nan
-    worst = episodes(evaluation)["episodes"][0]
+
+    def broken(found: Sequence[Extremal], paths: Sequence[Trajectory]) -> Any:
+        paths[0].clearance[1] = torch.nan
+        return zip(found, paths, strict=True)
+
+    worst = kept_of(Walkers(), straight, sets, broken)["episodes"][0]
     assert (worst["kind"], worst["collided"]) == ("worst", True)
     assert worst["distance"] == pytest.approx(1.8, abs=2e-3)
 
@@ -120,7 +134,7 @@ def test_three_dimensions_and_the_size_of_the_file() -> None:
     def hover(tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
         return torch.tensor([0.0, 0.0, 9.81]).expand(len(x), 2, 3)
 
-    kept = episodes(evaluated(game, hover, found))
+    kept = kept_of(game, hover, found)
     assert kept["dimensions"] == 3
     assert len(json.dumps(kept)) / len(kept["episodes"]) < 8000
 
@@ -129,18 +143,23 @@ def test_one_player_alone_has_episodes_without_a_radius() -> None:
     a, b, r, q, s = (torch.full((1, 1, 1), c) for c in (0.4, 1.3, 0.7, 0.1, 0.9))
     game = LinearQuadratic(a, b, r[..., 0], q, s)
     found = [fake_labels(game, (0.5,), 3)]
-    evaluation = evaluated(game, lambda tau, x, theta: torch.zeros(len(x), 1, 1), found, dt=0.1)
-    played = [episode._replace(clearance=torch.ones(3)) for episode in evaluation.played]
-    kept = episodes(evaluation._replace(played=played))
+
+    def still(tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
+        return torch.zeros(len(x), 1, 1)
+
+    def safe(found: Sequence[Extremal], paths: Sequence[Trajectory]) -> Any:
+        return zip(found, (one._replace(clearance=torch.ones(3)) for one in paths), strict=True)
+
+    kept = kept_of(game, still, found, safe, dt=0.1)
     assert [episode["kind"] for episode in kept["episodes"]] == ["worst", "typical"]
     assert kept["players"] == 1
     assert all(episode["radius"] is None for episode in kept["episodes"])
-    assert outcome(game, found[0], played[0], 0.02).distance_quantiles is None
+    assert outcome(numbers_of(game, *next(play(game, still, found, 0.1))), 0.02).distance_quantiles is None
 
 
 def test_where_the_constraint_is_no_distance_there_is_no_radius(sets: list[Extremal]) -> None:
     game = Walkers()
     game.constraint_unit, game.distance_constraints = "", False
-    kept = episodes(evaluated(game, straight, sets))
+    kept = kept_of(game, straight, sets)
     assert kept["constraint_unit"] == ""
     assert all(episode["radius"] is None for episode in kept["episodes"])

@@ -8,7 +8,8 @@ from torch import Tensor
 
 from hno.control.rollout import rollout
 from hno.evaluation.metrics import clopper_pearson
-from hno.evaluation.outcome import outcome, outcomes, pooled
+from hno.evaluation.outcome import Outcome, numbers_of, outcome, outcomes, pooled
+from hno.games import Game
 from hno.types import Extremal, Trajectory, join, part
 from tests.fakes import fake_labels
 from tests.lq import LinearQuadratic
@@ -29,6 +30,11 @@ def played(heights: list[float]) -> Trajectory:
     return rollout(GAME, straight, x0, theta, 0.1)
 
 
+def came(labels: Extremal, episodes: Trajectory, game: Game = GAME) -> Outcome:
+    """What came of episodes from the starts of labels."""
+    return outcome(numbers_of(game, labels, episodes), 0.02)
+
+
 def costing(cost: Tensor) -> Extremal:
     """Labels with these costs of the players, (B, 2)."""
     label = fake_labels(GAME, count=len(cost))
@@ -39,7 +45,7 @@ def costing(cost: Tensor) -> Extremal:
 def test_costs_are_compared_with_those_of_the_labels_row_by_row() -> None:
     episodes = played([0.5, 0.6, 0.7])
     cheaper = torch.tensor([1.0, 5.0, 2.0])
-    found = outcome(GAME, costing(-episodes.value.double() - cheaper[:, None] / 2), episodes, 0.02)
+    found = came(costing(-episodes.value.double() - cheaper[:, None] / 2), episodes)
     assert (found.safe_starts, found.collisions) == (3, 0)
     assert found.median_excess_cost == pytest.approx(2)
     assert found.largest_excess_cost == pytest.approx(5)
@@ -51,23 +57,23 @@ def test_a_start_that_does_not_count_changes_no_number_of_those_that_do() -> Non
     labels = costing(torch.ones(3, 2))
     labels.clearance[0] = -1.0
     rest = torch.tensor([1, 2])
-    alone = outcome(GAME, part(labels, rest), Trajectory(episodes.t, *(c[rest] for c in episodes[1:])), 0.02)
-    assert outcome(GAME, labels, episodes, 0.02) == alone._replace(starts=3, inevitable=1)
+    alone = came(part(labels, rest), Trajectory(episodes.t, *(c[rest] for c in episodes[1:])))
+    assert came(labels, episodes) == alone._replace(starts=3, inevitable=1)
 
 
 def test_a_broken_policy_is_no_safe_one() -> None:
     episodes = played([0.9, 0.9])
     broken = episodes._replace(clearance=torch.full((2,), torch.nan), u=episodes.u * torch.nan)
-    found = outcome(GAME, costing(torch.zeros(2, 2)), broken, 0.02)
+    found = came(costing(torch.zeros(2, 2)), broken)
     assert (found.collisions, found.rate) == (2, 1.0)
 
 
 def test_types_together_are_one_set_of_episodes() -> None:
     halves = [played([0.0, 0.5]), played([0.6])]
     labels = [costing(torch.ones(2, 2)), costing(torch.ones(1, 2))]
-    parts, whole = outcomes(GAME, labels, halves, 0.02)
-    assert whole == outcome(GAME, join(labels), played([0.0, 0.5, 0.6]), 0.02)
-    assert parts == [outcome(GAME, *pair, 0.02) for pair in zip(labels, halves, strict=True)]
+    parts, whole = outcomes([numbers_of(GAME, *pair) for pair in zip(labels, halves, strict=True)], 0.02)
+    assert whole == came(join(labels), played([0.0, 0.5, 0.6]))
+    assert parts == [came(*pair) for pair in zip(labels, halves, strict=True)]
     assert (whole.collisions, whole.safe_starts) == (1, 3)
     assert whole.largest_excess_cost == max(found.largest_excess_cost or 0 for found in parts)
 
@@ -80,7 +86,7 @@ def test_one_player_has_costs_but_no_distance() -> None:
     episodes = Trajectory(
         labels.t.float(), labels.x.float(), u, -torch.ones(3, 1), torch.ones(3), torch.full((3,), torch.inf)
     )
-    found = outcome(game, labels, episodes, 0.02)
+    found = came(labels, episodes, game)
     assert (found.safe_starts, found.collisions, found.saturated) == (3, 0, 0.0)
     assert (found.median_min_distance, found.distance_quantiles) == (None, None)
     assert found.median_excess_costs == pytest.approx((found.median_excess_cost,))

@@ -5,29 +5,35 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
 import resource
 import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import pytest
 import safetensors
 import torch
 
+from hno.cli import evaluate, pages
 from hno.cli.results import Results
 from hno.data import folders
 from hno.data.labels import Request, label_bytes, label_set, labels_for
 from hno.data.store import read_labels, start_count, write_labels
+from hno.evaluation.outcome import Played
 from hno.games import make
 from hno.training.fit import _check_room
 from hno.training.saving import LAST, read_content, write_checkpoint
 from tests.cli import conftest as cli
-from tests.cli.conftest import Command
+from tests.cli.conftest import Command, save_random
 from tests.data import conftest
 from tests.data.conftest import Asked
 from tests.fakes import fake_labels
 from tests.operators.conftest import small_operator
+from tests.report.folders import make_results, write_run
 
 asked, command, clean_globals, no_pages = conftest.asked, cli.command, cli.clean_globals, cli.no_pages
 REQUEST = Request((1.0, 5.0), 6, 0, "train")
@@ -62,13 +68,13 @@ def place(request: pytest.FixtureRequest) -> Path:
     return request.getfixturevalue(request.param)
 
 
-def fill(place: Path) -> None:
-    """Leave room for two pages."""
+def fill(place: Path, room: int = 8192) -> None:
+    """Leave so much room, two pages by default."""
     if not os.path.ismount(place):
-        resource.setrlimit(resource.RLIMIT_FSIZE, (8192, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
+        resource.setrlimit(resource.RLIMIT_FSIZE, (room, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
         return
     free = os.statvfs(place)
-    (place / "filler").write_bytes(bytes(free.f_bavail * free.f_frsize - 8192))
+    (place / "filler").write_bytes(bytes(free.f_bavail * free.f_frsize - room))
 
 
 def read_only(folder: Path) -> None:
@@ -112,6 +118,19 @@ def test_a_checkpoint_that_does_not_fit_leaves_those_that_were_there(place: Path
     assert read_content(path) == {"step": 1}
 
 
+def test_a_page_that_does_not_fit_leaves_the_one_that_was_there(place: Path) -> None:
+    made = make_results("narrow_road", "sno", "tanh", 0, np.random.default_rng(0))
+    write_run(place / "run", made, extras=False)
+    (place / "run" / "report.html").write_text("the page before")
+    before = files(place)
+    fill(place)
+    line = pages.write(place / "run")
+    assert line.startswith("Page: could not be written (")
+    assert re.search(r"report\.html could not be written .*what was there before is whole", line)
+    assert "\n" not in line
+    assert files(place) == before
+
+
 def test_a_set_that_does_not_fit_keeps_its_shards(place: Path, asked: Asked) -> None:
     game = make("narrow_road")
     labels_for(game, [REQUEST._replace(starts=1)], place, workers=1)
@@ -130,6 +149,26 @@ def test_a_full_disk_ends_the_labels_command_with_one_message(disk: Path, comman
     assert "Free some space" in run.text
     assert "Traceback" not in run.text
     assert asked.total() == 0
+
+
+@pytest.mark.usefixtures("cache")
+def test_a_disk_that_fills_up_ends_an_evaluation_with_one_message(
+    disk: Path, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    checkpoint, original = save_random(tmp_path / "random" / "last.ckpt"), evaluate.numbers_of
+
+    def numbers_of(*arguments: Any) -> Played:
+        fill(disk, 0)
+        return original(*arguments)
+
+    monkeypatch.setattr(evaluate, "numbers_of", numbers_of)
+    options = "theta=1,1", "starts=4", "workers=1", "dt=0.1", "residuals=false"
+    run = command("evaluate", f"checkpoint={checkpoint}", *options, folder=disk / "run")
+    assert run.code == 1
+    assert "Traceback" not in run.text
+    assert run.text.count("results.json could not be written (No space left on device)") == 1
+    assert run.results["status"] == "running"
+    assert not list(run.folder.glob(".*.*"))
 
 
 def test_a_read_only_cache_is_read_and_refused_before_solving(disk: Path, asked: Asked) -> None:

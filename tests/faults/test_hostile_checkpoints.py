@@ -324,12 +324,23 @@ def test_a_checkpoint_beyond_the_end_is_refused(trained: dict[str, Any]) -> None
         check_training_state("a.ckpt", trained, 7)
 
 
+def moments(whole: dict[str, Any]) -> dict[str, Any]:
+    """The state of the first matrix of weights."""
+    return next(kept for kept in whole["optimizer_states"][0]["state"].values() if kept["exp_avg"].dim() > 1)
+
+
 RESTORED = {
     "a callback": lambda whole: whole["callbacks"]["StopOnDivergence"].clear(),
     "the data": lambda whole: whole["GameData"].update(visits=[3]),
     "a loop": lambda whole: whole["loops"]["fit_loop"].pop("epoch_loop.batch_progress"),
     "the groups": lambda whole: whole["optimizer_states"][0]["param_groups"].append({"params": []}),
     "the weights": lambda whole: whole["state_dict"].popitem(),
+    "a moment": lambda whole: moments(whole).update(exp_avg=torch.zeros(3)),
+    "a moment of more axes": lambda whole: moments(whole).update(exp_avg=moments(whole)["exp_avg"][None]),
+    "a moment of one number": lambda whole: moments(whole).update(exp_avg_sq=torch.tensor(1.0)),
+    "no moment": lambda whole: moments(whole).pop("exp_avg_sq"),
+    "a number for a moment": lambda whole: moments(whole).update(exp_avg=3.0),
+    "preconditioners": lambda whole: moments(whole).update(GG=[torch.eye(2)] * 2, Q=[torch.eye(2)] * 2),
 }
 
 

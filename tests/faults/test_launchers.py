@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import os
+import signal
 from pathlib import Path
 
 import pytest
 
+from hno.training.optimizers import optimizers
 from tests.cli.conftest import SMOKE, clean_globals, command, no_pages  # noqa: F401  # fixtures
 from tests.cli.conftest import Command as Run
 
@@ -25,6 +28,30 @@ def test_a_refused_job_makes_the_exit_code_of_its_sweep(command: Run, tmp_path: 
     assert run.text.count("needs a weight and every weight a term") >= 2
     assert f"Page: {tmp_path}/a b=(c)" in run.text
     assert not list((tmp_path / "a b=(c)").glob(".jobs-*"))
+
+
+def killing(parameters: object, lr: float = 1.0) -> None:
+    """An optimiser in whose place the process is killed, as the operating system does for lack of memory."""
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+@pytest.mark.slow
+def test_a_worker_that_is_killed_ends_the_sweep_with_the_likely_reason(
+    command: Run,  # noqa: F811
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    optimizers.names()
+    monkeypatch.setattr(optimizers, "_classes", dict(optimizers._classes))
+    optimizers.register("killing")(killing)
+    words = ("optimizer=killing", "seed=0,1", f"hydra.sweep.dir={tmp_path}/sweep")
+    run = command("train", "-m", *SMOKE, *words, *LAUNCHERS["joblib"])
+    assert run.code == 1, run.text
+    assert "The launcher ended before all jobs did: " in run.text
+    assert "excessive memory usage" in run.text
+    assert "Traceback" not in run.text
+    assert f"Page: {tmp_path}/sweep" in run.text
 
 
 def test_a_launcher_that_is_not_there_is_named_with_its_package(command: Run, tmp_path: Path) -> None:  # noqa: F811

@@ -191,6 +191,56 @@ class RewardForCost(Encounter):
         return -x.square().sum(-1)
 
 
+class WayTravelled(Encounter):
+    """Everybody wants to get far away, in whatever direction."""
+
+    def terminal_value(self, x: Tensor) -> Tensor:
+        return x[..., :2].square().sum(-1).add(1).sqrt()
+
+
+class Speed(Encounter):
+    """Everybody likes to move."""
+
+    def state_cost(self, x: Tensor, theta: Tensor) -> Tensor:
+        return -x[..., 2:].square().sum(-1).add(1).sqrt()
+
+
+class OneStateDrift(Encounter):
+    def drift(self, x: Tensor) -> Tensor:
+        return x[..., 2:3]
+
+
+class PlayersFirst(Encounter):
+    """Right for one state, and where there are as many rows as players."""
+
+    def drift(self, x: Tensor) -> Tensor:
+        found = torch.zeros_like(x)
+        for player in range(self.players):
+            found[player] = double_integrator_drift(x[player])
+        return found
+
+
+class HalfSquare(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, x):
+        ctx.save_for_backward(x)
+        return x.square()
+
+    @staticmethod
+    def backward(ctx, slope):
+        return slope * ctx.saved_tensors[0]
+
+
+class WrongGradient(Encounter):
+    def terminal_value(self, x: Tensor) -> Tensor:
+        return -HalfSquare.apply(x).sum(-1)
+
+
+class NoGradient(Encounter):
+    def constraint(self, x: Tensor, theta: Tensor) -> Tensor:
+        return super().constraint(x, theta).detach()
+
+
 class ReversedPenalty(Encounter):
     def penalty(self, x: Tensor, theta: Tensor) -> Tensor:
         return 1e4 - super().penalty(x, theta)
@@ -334,6 +384,10 @@ def test_a_plain_game_keeps_the_contract_and_is_left_alone():
         (TurnedSign, r"an initial_box where players are mostly safe; got .*turn its sign"),
         (CostForReward, r"a terminal_value that is a reward; .*V = -J"),
         (RewardForCost, r"a state_cost that is a cost; .*V = -J"),
+        (OneStateDrift, r"drift of shape \(2, 4\); got \(2, 1\).*Index the last axes"),
+        (PlayersFirst, r"dynamics to answer each row of a batch as if alone; .*the first ones are the batch"),
+        (WrongGradient, r"derivatives of terminal_value that are those of its values; .*the derivative of its forward"),
+        (NoGradient, r"derivatives of constraint that are those of its values; .*No detach"),
         (NoStateBox, r"an attribute state_box; got none.*constructor"),
         (NoSuchState, r"places 0 to 3 in `periodic`; got \(4,\)"),
         (NotPeriodic, r"repeats after one edge of state_box along the periodic state 0; .*2 pi"),
@@ -413,6 +467,13 @@ class Pursuit(Encounter):
 def test_opposed_interests_are_pointed_out():
     with pytest.warns(UserWarning, match=r"Players \[0, 1\] have opposed interests"):
         check_game(Pursuit())
+
+
+@pytest.mark.parametrize(("game", "name"), [(WayTravelled, "terminal_value"), (Speed, "state_cost")])
+def test_rewards_that_grow_with_distance_are_allowed_and_said(game, name):
+    """What grows with its square in every direction is a cost with the wrong sign (`CostForReward`)."""
+    with pytest.warns(UserWarning, match=rf"{name} is one that .* without bound for all players\. .*If that is meant"):
+        check_game(game())
 
 
 def test_shared_interests_are_not(recwarn):

@@ -69,6 +69,15 @@ def trained(
     return operator, found
 
 
+def test_a_training_prints_nothing(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level("DEBUG"):
+        trained(tmp_path)
+    assert tuple(capfd.readouterr()) == ("", "")
+    assert [line.message for line in caplog.records if line.name.startswith("lightning")] == []
+
+
 POTENTIAL = replace(architecture(), function=Choice("potential", {"exact_terminal": False}))
 
 
