@@ -20,7 +20,7 @@ OWN: dict[str, type[Game]] = {"bicycle": Bicycle, "three_walkers": ThreeWalkers,
 def operator_of(case: str) -> ValueOperator:
     """A small operator with random weights: "game function activation members"."""
     game, function, activation, members = case.split()
-    options = {"members": int(members)} if function == "value" else {}
+    options = {"members": int(members)}
     parts = Choice(function, options), Choice("deeponet", {"width": 12, "depth": 3}), Choice(activation)
     torch.manual_seed(0)
     operator = make_operator(OWN[game]() if game in OWN else make(game), Architecture(*parts))
