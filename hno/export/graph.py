@@ -291,3 +291,18 @@ def stage(outputs: Iterable[Node], early: frozenset[str]) -> list[Node]:
     later = [node for node in nodes if not first(node)]
     edges = [below for node in later for below in node.inputs if first(below)] + [end for end in ends if first(end)]
     return list(dict.fromkeys(cut for edge in edges for cut in cuts(edge)))
+
+
+def parts(program: Program, single: Program) -> dict[str, tuple[dict[str, Node], dict[str, Node]]]:
+    """Inputs and outputs of what is written as separate graphs, by name.
+
+    Everything for any batch, and two halves for one state: what types determine, and controls.
+    """
+    early = stage([single.outputs["control"]], frozenset(["theta"]))
+    prepared = {f"prepared{k}": node for k, node in enumerate(early)}
+    state = {name: single.inputs[name] for name in ("tau", "x")}
+    return {
+        "controller": (program.inputs, program.outputs),
+        "prepare": ({"theta": single.inputs["theta"]}, prepared),
+        "control": ({**prepared, **state}, {"control": single.outputs["control"]}),
+    }

@@ -15,7 +15,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hno.export.c_files import MANY, c_files
+from hno.export.graph import Program
 from hno.export.numpy_source import numpy_files
+from hno.export.onnx_model import onnx_files
+from hno.export.torch_program import torch_files
 from hno.export.trace import Traced, answers, answers_at_one_state, for_any_batch, in_double, points, traced
 from hno.games import Game, games
 from hno.operators.base import ValueOperator
@@ -39,8 +42,12 @@ class ExportError(RuntimeError):
 
 
 def _numpy(operator: ValueOperator, about: Mapping[str, Any]) -> Mapping[str, str]:
-    single = traced(answers(operator), operator.game, 1)
-    return numpy_files(for_any_batch(operator), single, operator.game, _heading(about))
+    return numpy_files(*programs(operator), operator.game, _heading(about))
+
+
+def programs(operator: ValueOperator) -> tuple[Program, Program]:
+    """For any batch, and for one state."""
+    return for_any_batch(operator), traced(answers(operator), operator.game, 1)
 
 
 def _c(operator: ValueOperator, about: Mapping[str, Any]) -> Mapping[str, str]:
@@ -52,7 +59,17 @@ def _c(operator: ValueOperator, about: Mapping[str, Any]) -> Mapping[str, str]:
     return c_files(traced(both, operator.game, 1), operator.game, _heading(about))
 
 
-KINDS: dict[str, Callable[[ValueOperator, Mapping[str, Any]], Mapping[str, str | bytes]]] = {"numpy": _numpy, "c": _c}
+def _onnx(operator: ValueOperator, about: Mapping[str, Any]) -> Mapping[str, bytes]:
+    return onnx_files(*programs(operator), about)
+
+
+def _torch(operator: ValueOperator, about: Mapping[str, Any]) -> Mapping[str, bytes]:
+    return torch_files(*programs(operator))
+
+
+KINDS: dict[str, Callable[[ValueOperator, Mapping[str, Any]], Mapping[str, str | bytes]]] = {
+    "numpy": _numpy, "c": _c, "onnx": _onnx, "torch": _torch,
+}  # fmt: skip
 """What can be written: from an operator in double precision and the manifest to the contents of files."""
 
 

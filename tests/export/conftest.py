@@ -1,6 +1,7 @@
 from __future__ import annotations
 
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -9,7 +10,7 @@ from hno_examples.bicycle import Bicycle
 from hno_examples.car_and_cyclist import CarAndCyclist
 from hno_examples.three_walkers import ThreeWalkers
 
-from hno.export import export
+from hno.export import export, write
 from hno.games import Game, make
 from hno.operators import Architecture, Choice, ValueOperator, make_operator
 
@@ -17,6 +18,7 @@ OWN: dict[str, type[Game]] = {"bicycle": Bicycle, "three_walkers": ThreeWalkers,
 """Games from outside the package."""
 
 
+@functools.cache
 def operator_of(case: str) -> ValueOperator:
     """A small operator with random weights: "game function activation members"."""
     game, function, activation, members = case.split()
@@ -29,13 +31,14 @@ def operator_of(case: str) -> ValueOperator:
 
 
 @pytest.fixture(scope="session")
-def exported(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, str], Path]:
-    """The folder of an exported controller, written once for each case and kind."""
-    made: dict[tuple[str, str], Path] = {}
+def exported(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[str, str], Path]]:
+    """The folder of an exported controller, written once for each case and kind; each case is traced once."""
 
+    @functools.cache
     def folder(case: str, kind: str) -> Path:
-        if (case, kind) not in made:
-            made[case, kind] = export(operator_of(case), kind, tmp_path_factory.mktemp("exported") / kind)
-        return made[case, kind]
+        return export(operator_of(case), kind, tmp_path_factory.mktemp("exported") / kind)
 
-    return folder
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("in_double", "programs"):
+            patch.setattr(write, name, functools.cache(getattr(write, name)))
+        yield folder

@@ -28,7 +28,7 @@ MORE = (
 )
 
 
-@pytest.mark.parametrize("kind", ["numpy", "c"])
+@pytest.mark.parametrize("kind", ["numpy", "c", "onnx", "torch"])
 @pytest.mark.parametrize("case", [*CASES, *(pytest.param(case, marks=pytest.mark.slow) for case in MORE)])
 def test_ten_thousand_answers_differ_by_rounding(exported, case: str, kind: str) -> None:
     checked = check(load(exported(case, kind)), in_double(operator_of(case)), 10_000, seed=2)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import importlib.util
+import json
 import re
 import shutil
 import subprocess
@@ -13,8 +14,12 @@ from pathlib import Path
 from types import ModuleType
 
 import numpy as np
+import onnx
+import onnxruntime
 import pytest
+import torch
 
+from hno.export.onnx_model import OPSET
 from hno.export.trace import answers, in_double, points
 from tests.export.conftest import operator_of
 
@@ -198,3 +203,31 @@ def test_numpy_warns_once_outside_the_box(module: ModuleType) -> None:
         module.control(prepared, 1.0, x)
     with warnings.catch_warnings(action="error"):
         module.control(prepared, 1.0, x)
+
+
+def test_the_onnx_model_says_what_it_is(exported) -> None:
+    folder, game = exported(CASE, "onnx"), operator_of(CASE).game
+    model = onnx.load(folder / "controller.onnx")
+    onnx.checker.check_model(model, full_check=True)
+    said = {entry.key: json.loads(entry.value) for entry in model.metadata_props}
+    assert (said["game"], said["constants"], said["horizon"]) == ("narrow_road", {}, 3.0)
+    assert said["type_box"] == [game.type_box.lo.tolist(), game.type_box.hi.tolist()]
+    assert said["state_box"] == [game.state_box.lo.tolist(), game.state_box.hi.tolist()]
+    assert said["units"]["tau"] == "s"
+    assert said["version"]
+    assert model.opset_import[0].version == OPSET
+    assert [axis.dim_param for axis in model.graph.input[1].type.tensor_type.shape.dim] == ["batch", "", ""]
+
+
+def test_the_halves_of_onnx_and_torch_are_the_whole_of_one_state(exported) -> None:
+    found = wanted()["control"][:1]
+    tau, x, theta = (part[:1] for part in asked())
+    halves = [onnxruntime.InferenceSession(exported(CASE, "onnx") / f"{name}.onnx") for name in ("prepare", "control")]
+    prepared = {f"prepared{k}": part for k, part in enumerate(halves[0].run(None, {"theta": theta}))}
+    (u,) = halves[1].run(None, {**prepared, "tau": tau, "x": x})
+    np.testing.assert_allclose(u, found, atol=1e-4)
+    first, second = (
+        torch.export.load(exported(CASE, "torch") / f"{name}.pt2").module() for name in ("prepare", "control")
+    )
+    (u,) = second(*first(torch.from_numpy(theta)), torch.from_numpy(tau), torch.from_numpy(x))
+    np.testing.assert_allclose(u, found, atol=1e-4)
