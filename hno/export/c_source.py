@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -197,11 +197,16 @@ class Body:
         left, right = node.inputs
         index, inner = _indices(node.shape), left.shape[-1]
         *outer, i, j = index
-        load, times = self.load(left, [*outer, i, "k"]), self.load(right, [*outer, "k", j])
-        if j == "0" and left.value is not None and left.value.ndim == 2:  # a constant matrix: its columns
-            turned = self.constants.place(np.ascontiguousarray(left.value.T), "real")
-            load = turned.at(["k", i])
         sizes = list(zip(index, node.shape, strict=True))
+        if j == "0" and left.value is None:  # each row is a sum
+
+            def product(named: Named) -> str:
+                return f"{self.load(left, [*outer, i, named('k')])} * {self.load(right, [*outer, named('k'), j])}"
+
+            return _nested(sizes, _total(place.at(index), [("k", inner)], product, "0.0f", "{0} += {1};"))
+        load, times = self.load(left, [*outer, i, "k"]), self.load(right, [*outer, "k", j])
+        if j == "0" and left.value is not None and left.value.ndim == 2:  # its columns
+            load = self.constants.place(np.ascontiguousarray(left.value.T), "real").at(["k", i])
         sizes.insert(-2 if j == "0" else -1, ("k", inner))
         return [
             *loops(node.shape, [f"{place.at(index)} = 0.0f;"]),
@@ -221,25 +226,14 @@ class Body:
         return self._reduced(node, place, "INFINITY", "{0} = smaller({0}, {1});")
 
     def _reduced(self, node: Node, place: Place, start: str, step: str) -> list[str]:
-        """Several running totals where the last axis is long, since one waits for itself."""
         (below,), axes = node.inputs, node.attributes["axes"]
         index = _indices(below.shape)
-        kept = [i for axis, i in enumerate(index) if axis not in axes]
-        sizes = [(i, below.shape[axis]) for axis, i in enumerate(index) if axis not in axes]
-        run = [(i, below.shape[axis]) for axis, i in enumerate(index) if axis in axes]
-        target = place.at(kept)
-        if len(run) == 1 and run[0][1] % LANES == 0 and run[0][1] > LANES:
-            lane, (name, count) = "l", run[0]
-            entry = self.load(below, [f"({name} + l)" if i == name else i for i in index])
-            body = [
-                f"float s[{LANES}];", *_nested([(lane, LANES)], [f"s[l] = {start};"]),
-                f"for (int {name} = 0; {name} < {count}; {name} += {LANES})",
-                *_nested([(lane, LANES)], ["    " + step.format("s[l]", entry)]),
-                f"{target} = {start};", *_nested([(lane, LANES)], [step.format(target, "s[l]")]),
-            ]  # fmt: skip
-            return _nested(sizes, body)
-        body = [f"{target} = {start};", *_nested(run, [step.format(target, self.load(below, index))])]
-        return _nested(sizes, body)
+        sizes = list(enumerate(zip(index, below.shape, strict=True)))
+        kept, run = ([pair for axis, pair in sizes if (axis in axes) == among] for among in (False, True))
+        target = place.at([i for i, _ in kept])
+        return _nested(
+            kept, _total(target, run, lambda named: self.load(below, [named(i) for i in index]), start, step)
+        )
 
     def _argmax(self, node: Node, place: Place) -> list[str]:
         (below,), (axis,) = node.inputs, node.attributes["axes"]
@@ -274,7 +268,26 @@ class Body:
 
 
 LANES = 8
-"""Running totals of a sum."""
+"""Running totals of a long sum: one would wait for itself."""
+Named = Callable[[str], str]
+
+
+def _total(
+    target: str, run: Sequence[tuple[str, int]], entry: Callable[[Named], str], start: str, step: str
+) -> list[str]:
+    """Statements that gather entries, which are given for what the loops are named, in a target."""
+    if len(run) != 1 or run[0][1] % LANES or run[0][1] == LANES:
+        return [f"{target} = {start};", *_nested(run, [step.format(target, entry(lambda name: name))])]
+    (name, count), lanes = run[0], [("l", LANES)]
+    moved = entry(lambda given: f"({name} + l)" if given == name else given)
+    return [
+        f"float s[{LANES}];",
+        *_nested(lanes, [f"s[l] = {start};"]),
+        f"for (int {name} = 0; {name} < {count}; {name} += {LANES})",
+        *_nested(lanes, ["    " + step.format("s[l]", moved)]),
+        f"{target} = {start};",
+        *_nested(lanes, [step.format(target, "s[l]")]),
+    ]
 
 
 def _indices(shape: Sequence[int]) -> list[str]:

@@ -107,6 +107,8 @@ class Builder:
 
     def _simpler(self, op: str, inputs: list[Node], shape: Shape) -> Node | None:
         first, last = inputs[0], inputs[-1]
+        if op == "where" and first.value is not None and first.value.all() == first.value.any():
+            return self.expand(inputs[1] if first.value.any() else last, shape)
         if op in ("add", "mul") and first.value is not None:  # constants stand behind
             return (
                 self.elementwise(op, [last, first], shape, "real")
@@ -181,6 +183,11 @@ class Builder:
         """sum, prod, max, min or argmax over some axes."""
         if op != "argmax" and all(node.shape[axis] == 1 for axis in axes):
             return self.reshape(node, shape)
+        if op == "sum" and node.op == "mul" and list(axes) == [len(node.shape) - 1]:
+            for row, table in (node.inputs, node.inputs[::-1]):
+                if row.shape[-2:-1] == (1,) and row.shape == (*table.shape[:-2], 1, table.shape[-1]):
+                    column = self.reshape(row, (*row.shape[:-2], row.shape[-1], 1))
+                    return self.reshape(self.node("matmul", [table, column], (*table.shape[:-1], 1), "real"), shape)
         kept = [size for axis, size in enumerate(node.shape) if axis not in axes]
         kind: Kind = "int" if op == "argmax" else node.kind
         return self.reshape(self.node(op, [node], kept, kind, axes=tuple(axes)), shape)

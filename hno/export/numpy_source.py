@@ -131,6 +131,10 @@ def _sizes(shape: Shape) -> str:
 
 
 def _reshape(node: Node, _: Mapping[str, Any], inputs: Sequence[str]) -> str:
+    (below,) = node.inputs
+    axis = below.attributes.get("axis", 0)
+    if below.op == "slice" and below.shape[axis] == 1 and node.shape == (*below.shape[:axis], *below.shape[axis + 1 :]):
+        return f"{inputs[0]}[{':, ' * axis}0]"
     return f"{inputs[0]}.reshape({', '.join(str(max(size, -1)) for size in node.shape) or '()'})"
 
 
