@@ -1,25 +1,26 @@
-"""Exported controllers of every kind behind one interface. Loading one runs it: it is a program, not data."""
+"""Exported controllers of every kind behind one interface. Loading one runs it: it is a program, not data.
+
+What one kind alone needs is imported there, which keeps the import of this package below 30 ms.
+"""
 
 from __future__ import annotations
 
-import ctypes
-import importlib.util
 import json
 import os
-import shutil
-import subprocess
-import tempfile
-import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, final
+from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hno.runtime.artefact import Artefact, ArtefactError, read_manifest
 
-Reals = NDArray[np.float32]
+if TYPE_CHECKING:
+    import ctypes
+
+    from numpy.typing import NDArray
+
+    Reals = NDArray[np.float32]
 
 
 def load(folder: str | Path) -> Artefact:
@@ -46,6 +47,8 @@ def load(folder: str | Path) -> Artefact:
 @final
 class _NumPy(Artefact):
     def __init__(self, about: Mapping[str, Any], folder: Path) -> None:
+        import importlib.util
+
         super().__init__(about)
         spec = importlib.util.spec_from_file_location("hno_exported_controller", folder / "controller.py")
         assert spec is not None
@@ -111,6 +114,8 @@ class _C(Artefact):
         return {name: part.reshape(-1, *shape) for (name, shape), part in zip(shapes, parts, strict=True)}
 
     def _call(self, name: str, count: int, *arrays: NDArray[Any]) -> None:
+        import ctypes
+
         code = getattr(self._library, name)(count, *(array.ctypes.data_as(ctypes.c_void_p) for array in arrays))
         if code < 0:
             raise ValueError(f"The controller refused with code {code}; see hno_controller.h.")
@@ -118,6 +123,11 @@ class _C(Artefact):
 
 def _compiled(folder: Path) -> ctypes.CDLL:
     """The shared library of a controller in C, in memory: its file is gone."""
+    import ctypes
+    import shutil
+    import subprocess
+    import tempfile
+
     names = [os.environ.get("CC", "cc"), "gcc", "clang"]
     compiler = next((found for name in names if (found := shutil.which(name))), None)
     if compiler is None:
@@ -176,6 +186,8 @@ class _Torch(Artefact):
 
 def _refuse_pickles(file: Path) -> None:
     """torch.export.load would unpickle what an archive says is pickled; those of `hno export` say so of nothing."""
+    import zipfile
+
     with zipfile.ZipFile(file) as archive:
         configs = [name for name in archive.namelist() if name.endswith("_config.json")]
         entries = [entry for name in configs for entry in json.loads(archive.read(name))["config"].values()]

@@ -25,6 +25,7 @@ from hno.operators import Architecture, Choice, make_operator
 from hno.runtime import ArtefactError, load, signed
 from hno.training.checkpoint import Provenance, record
 from hno.training.saving import seal
+from tests.conftest import TEST
 from tests.export.conftest import operator_of
 
 CASE = "narrow_road potential sin 1"
@@ -135,7 +136,7 @@ def test_a_checkpoint_is_exported_and_evaluated(tmp_path: Path, capsys: pytest.C
         "game": "narrow_road", "operator": "sno", "function": "potential", "activation": "sin"
     }  # fmt: skip
     assert policy.types == [(1.0, 1.0)]
-    options = {"theta": "1,1", "starts": 4, "dt": 0.1}
+    options = {"theta": "1,1", "starts": TEST.starts, "seed": TEST.seed, "dt": 0.1}
     exported, own = (hno.evaluate(path, settings=options)["table"] for path in (folder, tmp_path / "best.ckpt"))
     assert exported[0]["collisions"] == own[0]["collisions"]
     assert exported[0]["value_error"] == pytest.approx(own[0]["value_error"], rel=1e-4)
