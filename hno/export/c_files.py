@@ -8,8 +8,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import torch
 
-from hno.export.c_source import TYPES, Body, Constants, Place, literal, split
-from hno.export.graph import Node, Program, ordered, stage
+from hno.export.c_loops import TYPES, Constants, Place, literal, strides_of
+from hno.export.c_source import Body, split
+from hno.export.graph import Node, Program, ordered
+from hno.export.stages import stage
 from hno.export.templates import filled
 from hno.export.trace import state_limits
 from hno.games import Box, Game
@@ -65,10 +67,7 @@ def c_files(program: Program, game: Game, about: str) -> dict[str, str]:
 
 
 def _place(array: str, node: Node) -> Place:
-    names = {"tau": "tau"}
-    return Place(
-        names.get(array, array), 0, tuple(int(np.prod(node.shape[axis + 1 :])) for axis in range(len(node.shape)))
-    )
+    return Place(array, 0, strides_of(node.shape))
 
 
 def _function(constants: Constants, given: Mapping[Node, Place], outputs: Mapping[str, Node]) -> list[str]:

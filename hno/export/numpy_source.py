@@ -9,7 +9,8 @@ from typing import Any
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hno.export.graph import ELEMENTWISE, Node, Program, Shape, ordered, stage
+from hno.export.graph import ELEMENTWISE, Node, Program, Shape, ordered
+from hno.export.stages import stage
 from hno.export.templates import filled
 from hno.export.trace import state_limits
 from hno.games import Game

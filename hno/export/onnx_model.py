@@ -8,7 +8,8 @@ from typing import Any, final
 
 import numpy as np
 
-from hno.export.graph import ELEMENTWISE, Kind, Node, Program, Shape, ordered, parts
+from hno.export.graph import ELEMENTWISE, Kind, Node, Program, Shape, ordered
+from hno.export.stages import parts
 
 OPSET = 18
 """Version of the operators."""

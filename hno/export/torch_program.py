@@ -9,7 +9,8 @@ from typing import Any, final
 import torch
 from torch import Tensor, nn
 
-from hno.export.graph import ELEMENTWISE, Kind, Node, Program, Shape, ordered, parts
+from hno.export.graph import ELEMENTWISE, Kind, Node, Program, Shape, ordered
+from hno.export.stages import parts
 
 TYPES: dict[Kind, torch.dtype] = {"real": torch.float32, "int": torch.int64, "bool": torch.bool}
 NAMES = {"and": "logical_and", "or": "logical_or", "not": "logical_not"}

@@ -14,8 +14,10 @@ from torch._decomp import core_aten_decompositions
 from torch.func import functionalize, jacfwd
 from torch.fx.experimental.proxy_tensor import make_fx
 
-from hno.export.graph import BatchError, Builder, Program, unified
-from hno.export.lowering import UnsupportedError, constant, lowered
+from hno.export.batch import BatchError, unified
+from hno.export.graph import Builder, Program
+from hno.export.lowering import UnsupportedError, lowered
+from hno.export.rules import constant
 from hno.games import Game
 from hno.operators.base import ValueOperator
 from hno.types import ROUNDING, Points, Types
