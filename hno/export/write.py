@@ -90,7 +90,7 @@ def export(operator: ValueOperator, to: str, folder: str | Path, origin: Mapping
 
     Raises:
         UnsupportedError: the game or the network has an operation that cannot be exported.
-        ExportError: the folder holds something else, or the artefact is not accurate.
+        ExportError: the folder holds something else, a package is missing, or the artefact is not accurate.
         ArtefactError: it cannot be checked here, for want of a compiler or a package.
     """
     place = Path(folder)
@@ -100,7 +100,10 @@ def export(operator: ValueOperator, to: str, folder: str | Path, origin: Mapping
         raise ExportError(f"{place} holds something else than an exported controller: name a new folder.")
     double = in_double(operator)
     about = _about(operator, to, origin or {})
-    files = KINDS[to](double, about)
+    try:
+        files = KINDS[to](double, about)
+    except ModuleNotFoundError as error:
+        raise ExportError(f"Writing {to} needs the package {error.name}: pip install 'hno[export]'.") from error
     place.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=place.parent, prefix=f".{place.name}.") as made:
         draft = Path(made) / "new"

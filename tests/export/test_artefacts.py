@@ -86,6 +86,12 @@ def test_a_missing_compiler_is_named(exported, monkeypatch: pytest.MonkeyPatch) 
         load(exported(CASE, "c"))
 
 
+def test_a_missing_package_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    with pytest.raises(ExportError, match=r"needs the package onnx: pip install 'hno\[export\]'"):
+        export(operator_of(CASE), "onnx", tmp_path / "new")
+
+
 class Odd(ThreeWalkers):
     """A game with an operation that no language has."""
 
