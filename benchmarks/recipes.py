@@ -26,7 +26,7 @@ from rich.console import Console
 from rich.table import Table
 
 from hno.cli.calls import train_settings
-from hno.cli.results import Results, config_hash
+from hno.cli.results import Results
 from hno.cli.settings import TrainSettings
 from hno.cli.train import train_operator
 from hno.control import Feedback
@@ -45,10 +45,10 @@ Cases = dict[str, tuple[Starts, list[int]]]
 
 def run(settings: TrainSettings, folder: Path) -> dict[str, Any]:
     """Train one recipe, or read what is there."""
-    path, key = folder / "results.json", config_hash(settings)
+    path, config = folder / "results.json", json.loads(settings.model_dump_json())
     if path.exists():
         content = json.loads(path.read_text())
-        if content["status"] == "trained" and content.get("config_hash") == key:
+        if content["status"] == "trained" and content.get("config") == config:
             return content
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "suites.json").unlink(missing_ok=True)
@@ -56,7 +56,7 @@ def run(settings: TrainSettings, folder: Path) -> dict[str, Any]:
         "game": settings.game.name,
         "operator": settings.operator.name,
         "seed": settings.seed,
-        "config_hash": key,
+        "config": config,
     }
     results = Results(path, head)
     try:

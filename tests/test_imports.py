@@ -12,7 +12,7 @@ import hno
 
 ROOT = Path(hno.__file__).parent
 LEVELS = (
-    {"types", "registry", "runtime"},
+    {"types", "registry", "processes", "runtime"},
     {"games"},
     {"pontryagin"},
     {"losses", "data"},

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig
@@ -12,6 +12,7 @@ from omegaconf import DictConfig
 from hno.cli.config import read
 from hno.cli.evaluate import check_evaluation, unseen_types
 from hno.cli.logs import check_wandb
+from hno.cli.resume import check_same_training, newest, own_configuration, run_folder, training_hash
 from hno.cli.settings import TrainSettings
 from hno.data import Collocation, GameData, LabelPlan, make_sampler
 from hno.data.curriculum import Curriculum
@@ -22,11 +23,10 @@ from hno.games.grid import parse_types
 from hno.losses import Objective, make_objective
 from hno.operators import Architecture, Choice, ValueOperator, make_operator
 from hno.training.adaptive import Adaptive
-from hno.training.checkpoint import find_checkpoint
+from hno.training.checkpoint import Provenance, check_resumable, record
 from hno.training.fit import Settings, make_trainer
 from hno.training.optimizers import make_optimizer
 from hno.training.quiet import quiet_lightning
-from hno.training.saving import RESUMED
 
 
 class Built(NamedTuple):
@@ -44,7 +44,9 @@ def check(config: DictConfig) -> TrainSettings:
     Raises:
         ValueError, LookupError: entries that are unknown or make no sense, together or for the game.
     """
-    settings = read(TrainSettings, config)
+    settings = read(TrainSettings, own_configuration(config))
+    if settings.resume is not None:
+        check_same_training(settings)
     if "wandb" in settings.logger.names:
         check_wandb()
     with warnings.catch_warnings(action="ignore"):  # the run warns
@@ -55,19 +57,19 @@ def check(config: DictConfig) -> TrainSettings:
         if settings.validation.types is not None:
             parse_types(game, settings.validation.types, key="validation.types")
         how_to_train(settings)
-        make_optimizer(steps=settings.trainer.max_steps, **settings.optimizer)
+        make_optimizer(steps=1, **settings.optimizer)
         _check_device(settings)
         if settings.evaluation.ntk:
             check_rows(built.operator, settings.evaluation.ntk_rows)
-    if settings.resume is not None:
-        find_checkpoint(settings.resume, RESUMED)
+    if settings.resume is not None and (path := newest(run_folder(settings.resume))):
+        check_resumable(path, record_of(settings, built), settings.trainer.max_steps)
     return settings
 
 
 def _check_device(settings: TrainSettings) -> None:
     try:
         with quiet_lightning():
-            make_trainer(how_to_train(settings), Path(), [], [], validates=False)
+            make_trainer(how_to_train(settings), Path(), [], [])
     except (MisconfigurationException, TypeError, ImportError) as error:
         raise ValueError(f"trainer.accelerator, trainer.devices or trainer.precision: {error}") from error
 
@@ -84,10 +86,16 @@ def build(settings: TrainSettings, report: Report | None = None) -> Built:
     architecture = Architecture(*(Choice(part.pop("name"), part) for part in parts))
     operator, objective = make_operator(game, architecture), make_objective(**settings.loss.model_dump())
     needed = objective.streams(exact_terminal=operator.meets_terminal)
-    plans = _labels(settings, game), _collocation(settings)
+    plans = _labels(settings, game), _collocation(settings, supervised="bvp" in needed)
     sizes = settings.data.batch_sizes.model_dump()
     data = GameData(game, needed, settings.seed, *plans, sizes, report, operator.potential)
     return Built(architecture, operator, objective, data)
+
+
+def record_of(settings: TrainSettings, built: Built) -> dict[str, Any]:
+    """What its checkpoints say of a training."""
+    origin = Provenance(settings.operator.name, built.data.type_list, settings.seed, training_hash(settings))
+    return record(built.data.game, built.architecture, origin)
 
 
 def _labels(settings: TrainSettings, game: Game) -> LabelPlan:
@@ -104,10 +112,11 @@ def _labels(settings: TrainSettings, game: Game) -> LabelPlan:
     )
 
 
-def _collocation(settings: TrainSettings) -> Collocation:
-    data, steps = settings.data, settings.trainer.max_steps
-    finish = round((1 - data.finish) * steps) if data.finish else None
-    curriculum = Curriculum(round(data.pretrain * steps), round(data.widening * steps), finish)
+def _collocation(settings: TrainSettings, *, supervised: bool) -> Collocation:
+    data, steps = settings.data, how_to_train(settings).planned
+    longer = supervised and settings.trainer.max_steps > steps  # what follows the plan is supervised
+    end = round((1 - data.finish) * steps) if data.finish or longer else None
+    curriculum = Curriculum(round(data.pretrain * steps), round(data.widening * steps), end)
     return Collocation(make_sampler(settings.sampler), curriculum, data.interior_types)
 
 
@@ -118,7 +127,7 @@ def how_to_train(settings: TrainSettings) -> Settings:
         steps=settings.trainer.max_steps,
         optimizer=settings.optimizer,
         stop_when_safe=settings.validation.stop_when_safe,
-        dt=settings.evaluation.dt,
+        dt=settings.validation.dt,
         adaptive=Adaptive(**settings.data.adaptive.model_dump()),
         **shared,
     )

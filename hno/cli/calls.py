@@ -11,6 +11,7 @@ from hno.cli import evaluate as evaluation
 from hno.cli.arguments import Arguments, quoted
 from hno.cli.build import check
 from hno.cli.config import compose, for_hydra, groups
+from hno.cli.output import fresh, owned
 from hno.cli.results import Results, recorded
 from hno.cli.settings import TrainSettings
 from hno.cli.train import head, train_operator
@@ -21,7 +22,7 @@ from hno.training.checkpoint import LearnedPolicy, load_policy
 def train(
     game: str | Game,
     method: str = "sno",
-    folder: str | Path = "outputs/python",
+    folder: str | Path | None = None,
     settings: Mapping[str, Any] | None = None,
 ) -> LearnedPolicy:
     """Solve labels and train an operator, as `hno train` does, without its evaluation.
@@ -29,25 +30,25 @@ def train(
     Args:
         game: a registered name, or a game of a registered class.
         method: a list of loss terms, such as "hno" or "sno"; `hno list method` lists them.
-        folder: where checkpoints and metrics go.
+        folder: where checkpoints and metrics go; by default a new one, `outputs/python` or with a number after it.
         settings: keys of `hno train --help` and their values, such as {"trainer.max_steps": 500, "activation": "tanh"}.
 
     Returns:
         The policy of the best checkpoint, or of the last one where validation did not play.
 
     Raises:
-        ValueError, LookupError: settings that are unknown or make no sense.
+        ValueError, LookupError: settings that are unknown or make no sense; or the folder is another run's.
         DivergedError: the loss, or the error on held-out labels, is no longer sound.
     """
     name = game if isinstance(game, str) else games.name_of(type(game))
     constants = {} if isinstance(game, str) else {f"game.constants.{k}": v for k, v in game.constants.items()}
     chosen = {"logger": "csv", "game": name, "operator": method, **constants, **(settings or {})}
     checked = train_settings(_overrides("train", chosen))
-    place = Path(folder)
-    place.mkdir(parents=True, exist_ok=True)
-    results = Results(place / "results.json", head(checked))
-    with recorded(results):
-        fitted = train_operator(checked, place, results)
+    place = fresh(Path("outputs/python")) if folder is None else Path(folder)
+    with owned(place, checked.resume):
+        results = Results(place / "results.json", head(checked))
+        with recorded(results):
+            fitted = train_operator(checked, place, results)
     return load_policy(fitted.checkpoint)
 
 
@@ -72,10 +73,10 @@ def evaluate(
     checked = evaluation.check(compose("evaluate", for_hydra("evaluate", Arguments([], chosen, {}))))
     with tempfile.TemporaryDirectory() as nowhere:
         place = Path(nowhere if folder is None else folder)
-        place.mkdir(parents=True, exist_ok=True)
-        results = Results(place / "results.json", evaluation.head(checked))
-        with recorded(results):
-            evaluation.evaluate(checked, results)
+        with owned(place):
+            results = Results(place / "results.json", evaluation.head(checked))
+            with recorded(results):
+                evaluation.evaluate(checked, results)
     return results.content
 
 

@@ -17,7 +17,7 @@ from hno.cli.arguments import Arguments
 from hno.cli.config import read
 from hno.cli.logs import label_progress, use_threads
 from hno.cli.media import draw_typical
-from hno.cli.results import Results, config_hash, write_json
+from hno.cli.results import Results, write_json
 from hno.cli.sections import chosen_sections, run_sections
 from hno.cli.settings import Episodes, EvaluateSettings
 from hno.control.exported import ExportedPolicy, is_exported, load_exported
@@ -67,7 +67,7 @@ def check(config: DictConfig) -> EvaluateSettings:
 def head(settings: EvaluateSettings) -> dict[str, Any]:
     """What results.json says from the beginning."""
     first = model_file(settings.checkpoint[0])
-    return {"checkpoint": first, "config_hash": config_hash(settings), "config": settings.model_dump()}
+    return {"checkpoint": first, "config": settings.model_dump()}
 
 
 def model_file(path: str) -> str:

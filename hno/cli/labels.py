@@ -22,6 +22,7 @@ from hno.data.labels import Request, default_cache, label_set, labels_for
 from hno.data.store import LabelFileError
 from hno.games import Game, make
 from hno.games.grid import parse_types
+from hno.processes import Interrupted
 from hno.types import Status
 
 COLUMNS = (
@@ -40,9 +41,9 @@ def run(given: Arguments) -> int:
         killed = "A worker process was killed, mostly for lack of memory. Finished shards are kept: try fewer workers."
         print(killed if isinstance(error, BrokenProcessPool) else error, file=sys.stderr)
         return 1
-    except KeyboardInterrupt:
-        print("Stopped. Finished shards are kept: the same command goes on from here.", file=sys.stderr)
-        return 130
+    except Interrupted as stop:
+        print(f"Interrupted by {stop}. Finished shards are kept: the same command goes on from here.", file=sys.stderr)
+        return stop.code
     return 0
 
 

@@ -7,6 +7,7 @@ import sys
 import tempfile
 import traceback
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,11 +20,13 @@ from hno.cli import pages
 from hno.cli.arguments import Arguments, UsageError, one_screen, quoted
 from hno.cli.config import REFUSALS, configured, for_hydra, register_plugins, sentence, under_hydra
 from hno.cli.logs import finish_wandb, send_lightning_to_hydra
+from hno.cli.output import fresh, owned
 from hno.cli.results import Results, recorded
 from hno.cli.schema import REGISTRIES
 from hno.cli.sections import show
 from hno.cli.sweep import Entry, Job, Ledger, show_jobs
 from hno.evaluation.format import NAMES, counted
+from hno.processes import Interrupted, interruptible, passed_on
 from hno.registry import UnknownNameError
 
 log = logging.getLogger(__name__)
@@ -58,28 +61,39 @@ def run(task: Task, given: Arguments) -> int:
         The exit code: 1 if a job failed.
 
     Raises:
-        UsageError: nothing was done, since the configuration makes no run.
+        UsageError: nothing was done, since the configuration makes no run, or its folder is another's.
+        Interrupted: a signal ended it.
     """
     if "--multirun" in given.flags:
         return _multirun(task, given)
-    if configured(task.name, task.check, given) is None:
+    settings = configured(task.name, task.check, given)
+    if settings is None:
         return 0  # a dry run
-    folders: list[Path] = []
-    succeeded: list[bool] = []
+    began, succeeded = False, False
 
     def job(config: DictConfig) -> None:
-        folders.append(Path(HydraConfig.get().runtime.output_dir))
-        succeeded.append(perform(task, task.check(config), folders[0]))
+        nonlocal began, succeeded
+        began = True
+        succeeded = perform(task, task.check(config), folder)
 
     register_plugins()
     try:
-        under_hydra(task.name, job, for_hydra(task.name, given))
+        folder = _chosen("hydra.run.dir", given, HydraConfig.get().run.dir)
+        words = [*for_hydra(task.name, given), f"hydra.run.dir={quoted(str(folder))}"]
+        with owned(folder, getattr(settings, "resume", None)):
+            under_hydra(task.name, job, words)
     except Exception as error:
-        if folders:
+        if began:
             raise
         raise _refusal(error) from error
-    print(pages.write(folders[0]))
-    return 0 if all(succeeded) else 1
+    print(pages.write(folder))
+    return 0 if succeeded else 1
+
+
+def _chosen(key: str, given: Arguments, folder: str) -> Path:
+    """The folder that the command line names; otherwise a new one, also for who starts in the same second."""
+    chosen = any(word.lstrip("+").startswith(f"{key}=") for word in given.overrides)
+    return Path(folder).absolute() if chosen else fresh(Path(folder).absolute())
 
 
 def _refusal(error: Exception) -> UsageError:
@@ -98,8 +112,9 @@ def _multirun(task: Task, given: Arguments) -> int:
     try:
         words = for_hydra(task.name, given)
         register_plugins()
-        with tempfile.TemporaryDirectory() as nowhere:
-            folder = Path(nowhere if dry else HydraConfig.get().sweep.dir).absolute()
+        with tempfile.TemporaryDirectory() as nowhere, ExitStack() as stack:
+            folder = Path(nowhere) if dry else _chosen("hydra.sweep.dir", given, HydraConfig.get().sweep.dir)
+            stack.enter_context(owned(folder, jobs=True))
             words = [*_here(words), *QUIET] if dry else words
             return _swept(task, ["--multirun", *words, f"hydra.sweep.dir={quoted(str(folder))}"], folder, dry)
     except REFUSALS as error:
@@ -120,7 +135,8 @@ def _swept(task: Task, words: Sequence[str], folder: Path, dry: bool) -> int:
             _job(task, config, ledger, own, dry)
 
         try:
-            under_hydra(task.name, job, words)
+            with passed_on(ledger.pass_on):
+                under_hydra(task.name, job, words)
         except Exception as error:
             if isinstance(error, REFUSALS) and not ledger.entries():
                 raise
@@ -129,6 +145,8 @@ def _swept(task: Task, words: Sequence[str], folder: Path, dry: bool) -> int:
             found = ledger.entries()
             if found and not dry:
                 show_jobs([entry.job for entry in found])
+        if ledger.signal is not None:
+            raise Interrupted(ledger.signal)
     refused = sum(not entry.succeeded for entry in found)
     if dry:
         print(counted(len(found), "job") + (f", {refused} refused" if refused else ""))
@@ -139,11 +157,13 @@ def _swept(task: Task, words: Sequence[str], folder: Path, dry: bool) -> int:
 
 def _job(task: Task, config: DictConfig, ledger: Ledger, own: Parts, dry: bool) -> None:
     """One job of a multirun, perhaps in another process, which is told what the user's own program registered."""
+    if ledger.signal is not None:
+        return
     for kind, parts in own.items():
         for name, part in parts.items():
             REGISTRIES[kind]().register(name)(part)
     current = Job.current()
-    ledger.write(Entry(current))
+    ledger.write(Entry.begun(current))
     if dry:
         print(f"{current.number}: {' '.join(current.settings)}")
     try:
@@ -151,7 +171,19 @@ def _job(task: Task, config: DictConfig, ledger: Ledger, own: Parts, dry: bool) 
     except Exception as error:
         print(f"   refused: {one_screen(sentence(error))}") if dry else _refuse(current, error)
     else:
-        ledger.write(Entry(current, dry or perform(task, settings, current.folder)))
+        ledger.write(Entry(current, dry or _performed(task, settings, current, ledger)))
+
+
+def _performed(task: Task, settings: Any, job: Job, ledger: Ledger) -> bool:
+    """Do a job in its folder; a signal ends the sweep, not only the job."""
+    try:
+        with interruptible(), owned(job.folder, getattr(settings, "resume", None)):
+            return perform(task, settings, job.folder)
+    except Interrupted as stop:
+        ledger.stop(stop.number)
+    except UsageError as error:
+        log.error("%s", error)
+    return False
 
 
 def _refuse(job: Job, error: Exception) -> None:

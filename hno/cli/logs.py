@@ -17,10 +17,12 @@ import lightning as L
 import torch
 import wandb
 from lightning.pytorch.callbacks import RichProgressBar
-from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger, WandbLogger
+from lightning.pytorch.loggers import Logger, TensorBoardLogger, WandbLogger
 
+from hno.cli.curve import CurveLogger
 from hno.cli.settings import TrainSettings
 from hno.data.labels import Progress, Report
+from hno.report.runs import METRICS
 
 log = logging.getLogger(__name__)
 MODES = ("online", "offline", "disabled", "shared", "dryrun", "run")
@@ -43,8 +45,8 @@ def use_threads(count: int | None) -> None:
         torch.set_num_threads(count)
 
 
-def loggers(settings: TrainSettings, folder: Path) -> list[Logger]:
-    """The chosen loggers, each once.
+def loggers(settings: TrainSettings, folder: Path, first: int = 0) -> list[Logger]:
+    """The chosen loggers, each once; they keep what they have of steps before the first one.
 
     Raises:
         RuntimeError: the package of a logger is not installed.
@@ -53,21 +55,25 @@ def loggers(settings: TrainSettings, folder: Path) -> list[Logger]:
     made: list[Logger] = []
     for name in dict.fromkeys(settings.logger.names):
         if name == "csv":
-            made.append(CSVLogger(folder, name="", version="csv"))
+            made.append(CurveLogger(folder / METRICS, first))
         elif name == "tensorboard":
             try:
-                made.append(TensorBoardLogger(folder, name="", version="tensorboard", default_hp_metric=False))
+                made.append(TensorBoardLogger(folder, "", "tensorboard", default_hp_metric=False, purge_step=first))
             except ModuleNotFoundError as error:
                 message = "TensorBoard is not installed: `pip install tensorboard`, or choose logger=csv."
                 raise RuntimeError(message) from error
         elif (mode := wandb_mode(settings.logger.mode)) != "disabled":
-            made.append(
-                WandbLogger(
-                    name=folder.name, save_dir=folder, mode=mode, project=settings.logger.project,
-                    group=folder.parent.name, config=settings.model_dump(),
-                )
-            )  # fmt: skip
+            made.append(_wandb(settings, folder, mode))
     return made
+
+
+def _wandb(settings: TrainSettings, folder: Path, mode: str) -> Logger:
+    """The run of the folder, if W&B left one there: it ends the names of its own folders with the run's id."""
+    known = sorted(folder.glob("wandb/*run-*-*"))
+    return WandbLogger(
+        name=folder.name, save_dir=folder, mode=mode, project=settings.logger.project, group=folder.parent.name,
+        config=settings.model_dump(), id=known[-1].name.rpartition("-")[2] if known else None, resume="allow",
+    )  # fmt: skip
 
 
 def finish_wandb(results: Mapping[str, Any]) -> None:

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import hno
 from hno.cli.arguments import FLAGS, Arguments, UsageError, one_screen, parse, quoted
+from hno.processes import Interrupted, interruptible
 from hno.registry import UnknownNameError, unknown_name
 
 
@@ -85,7 +86,8 @@ def main(given: Sequence[str] | None = None, prog: str | None = None) -> int:
         prog: how the command was called, for its help.
 
     Returns:
-        The exit code: 2 if the command was refused before any work, 1 if work failed.
+        The exit code: 2 if the command was refused before any work, 1 if work failed, 128 and the signal's number if
+        one ended it.
     """
     name, *rest = [*(sys.argv[1:] if given is None else given)] or ["--help"]
     try:
@@ -94,14 +96,18 @@ def main(given: Sequence[str] | None = None, prog: str | None = None) -> int:
             return 0
         if name not in COMMANDS:
             raise UsageError(unknown_name("command", name, list(COMMANDS)))
-        return _run(COMMANDS[name], parse(rest), prog or f"hno {name}")
+        with interruptible():
+            return _run(COMMANDS[name], parse(rest), prog or f"hno {name}")
     except BrokenPipeError:  # whoever read what is printed has read enough, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except (UnknownNameError, OSError, ValueError) as error:
         print(one_screen(str(error)), file=sys.stderr)
         return 2 if isinstance(error, UsageError) else 1
-    except KeyboardInterrupt:
+    except Interrupted as stop:
+        print(f"Interrupted by {stop}.", file=sys.stderr)
+        return stop.code
+    except KeyboardInterrupt:  # of a program that calls this in a thread
         print("Interrupted.", file=sys.stderr)
         return 130
 

@@ -18,7 +18,7 @@ from hno.evaluation.outcome import pooled
 
 log = logging.getLogger(__name__)
 
-CHOSEN = (*NAMES, "seed", "config_hash")
+CHOSEN = (*NAMES, "seed", "training_hash")
 """What TensorBoard shows beside the numbers of a run."""
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from hno.cli.arguments import Arguments, UsageError
 from hno.cli.config import configured, read
 from hno.cli.settings import ReportSettings
+from hno.processes import Interrupted
 
 PAGE = "report.html"
 
@@ -69,7 +70,7 @@ def _report(settings: ReportSettings, folder: Path) -> None:
             write_page(load(folder), page, settings.watch)
             print(f"{page} is up to date; the next look comes in {settings.watch:g} s (Ctrl-C ends).", flush=True)
             time.sleep(settings.watch)
-    except KeyboardInterrupt:
+    except (Interrupted, KeyboardInterrupt):
         pass  # the last page does not load itself again
     write_page(load(folder), page)
     print(page)

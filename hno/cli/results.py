@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 import platform
@@ -12,26 +11,11 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel
-
 import hno
 from hno.data.store import replace_whole
+from hno.processes import Interrupted
 
 PACKAGES = ("torch", "lightning", "torchmetrics", "hydra-core", "omegaconf", "wandb", "scipy", "safetensors")
-
-
-NUMBERS_DO_NOT_DEPEND_ON: dict[str, Any] = {
-    **dict.fromkeys(("logger", "resume", "checkpoint", "cache", "workers", "threads"), True),
-    "data": {"cache", "workers"},
-    "trainer": {"print_every", "threads"},
-}
-"""Folders, logging and the number of workers."""
-
-
-def config_hash(settings: BaseModel) -> str:
-    """Hash of what determines a run's numbers."""
-    content = settings.model_dump(exclude=NUMBERS_DO_NOT_DEPEND_ON)
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def versions() -> dict[str, str]:
@@ -65,8 +49,8 @@ class Results:
     def __init__(self, path: Path, head: Mapping[str, Any]) -> None:
         self.path = path
         self.content: dict[str, Any] = {
-            "status": "running", "reason": None, **head, "seconds": {}, "table": [],
-            "episodes": None, "versions": versions(),
+            "status": "running", "reason": None, "seconds": {}, "table": [], "episodes": None, "versions": versions(),
+            **head,
         }  # fmt: skip
         self.write()
 
@@ -87,11 +71,16 @@ class Results:
 
 @contextmanager
 def recorded(results: Results) -> Iterator[None]:
-    """Work whose end is in the results: that it is finished, or why it failed."""
+    """Work whose end is in the results: that it is finished, which signal interrupted it, or why it failed."""
     try:
         yield
+    except Interrupted as stop:
+        results.update(status="interrupted", reason=str(stop))
+        raise
+    except (KeyboardInterrupt, SystemExit):  # Lightning turns the one into the other
+        results.update(status="interrupted", reason="SIGINT")
+        raise
     except BaseException as error:
-        interrupted = isinstance(error, (KeyboardInterrupt, SystemExit))  # Lightning turns the one into the other
-        results.update(status="failed", reason="interrupted" if interrupted else f"{type(error).__name__}: {error}")
+        results.update(status="failed", reason=f"{type(error).__name__}: {error}")
         raise
     results.update(status="finished")

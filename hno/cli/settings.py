@@ -82,6 +82,7 @@ class TrainerSettings(Settings):
     """How long and on what."""
 
     max_steps: Size
+    schedule_steps: Size | None
     accelerator: Text
     devices: Loose
     precision: Loose
@@ -129,6 +130,8 @@ class ValidationSettings(Settings):
     starts: Size
     stop_when_safe: bool
     seed: Seed
+    clearance: Amount
+    dt: Positive
 
 
 class TrainSettings(Settings):

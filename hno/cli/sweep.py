@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
+import platform
+import shlex
+import signal
 import sys
 import tempfile
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,8 +22,10 @@ from rich.table import Table
 
 from hno.cli import pages
 from hno.cli.results import write_json
+from hno.data.store import replace_whole
 from hno.evaluation.format import NAMES, counted, interval, percent, signed, types
 from hno.evaluation.outcome import pooled
+from hno.report.runs import LOST, at_work
 
 NAMED = (*NAMES, "seed")
 """Entries of results.json that name a job, in the order by which jobs are sorted."""
@@ -50,14 +56,12 @@ class Job(NamedTuple):
         return cls(number, Path(hydra.runtime.output_dir), settings)
 
     def results(self) -> dict[str, Any]:
-        """Content of its results.json; without one that can be read, or with one that has no end, a failure."""
+        """Content of its results.json; without one that can be read, a failure; with one that has no end, lost."""
         try:
             found = dict(json.loads((self.folder / "results.json").read_text()))
         except (OSError, TypeError, ValueError) as error:
             return {"status": "failed", "reason": f"no results ({error})"}
-        if found.get("status") == "running":  # the sweep is over
-            return {**found, "status": "failed", "reason": "its process ended before the job did"}
-        return found
+        return found if at_work(self.folder, found) else {**found, **LOST}
 
 
 class Entry(NamedTuple):
@@ -65,10 +69,20 @@ class Entry(NamedTuple):
 
     job: Job
     succeeded: bool = False
+    process: tuple[str, int] | None = None
+    """Host and number of the process that does it, while it does."""
+
+    @classmethod
+    def begun(cls, job: Job) -> Entry:
+        """Of a job that this process does."""
+        return cls(job, process=(platform.node(), os.getpid()))
 
 
 class Ledger(NamedTuple):
-    """Which jobs of a multirun began and which succeeded, in a folder that every process of the sweep can write."""
+    """Which jobs of a multirun began and which succeeded, in a folder that every process of the sweep can write.
+
+    It also says which signal ended the sweep: jobs that have not begun then do not.
+    """
 
     folder: Path
 
@@ -83,14 +97,36 @@ class Ledger(NamedTuple):
     def write(self, entry: Entry) -> None:
         """Add a job, or replace its entry."""
         number, folder, settings = entry.job
-        content = {"job": [number, str(folder), settings], "succeeded": entry.succeeded}
+        content = {"job": [number, str(folder), settings], "succeeded": entry.succeeded, "process": entry.process}
         write_json(self.folder / f"{number}.json", content)
 
     def entries(self) -> list[Entry]:
         """Jobs that began, in their order."""
         found = [json.loads(path.read_text()) for path in self.folder.glob("*.json")]
-        jobs = [(*entry["job"], entry["succeeded"]) for entry in found]
-        return [Entry(Job(n, Path(at), tuple(settings)), done) for n, at, settings, done in sorted(jobs)]
+        jobs = [(*entry["job"], entry["succeeded"], entry["process"]) for entry in found]
+        return [Entry(Job(n, Path(at), tuple(settings)), *rest) for n, at, settings, *rest in sorted(jobs)]
+
+    @property
+    def signal(self) -> int | None:
+        """The signal that ended the sweep; a ledger that is gone is one of a sweep that ended."""
+        if not self.folder.is_dir():
+            return int(signal.SIGTERM)
+        mark = self.folder / "signal"
+        return int(mark.read_text()) if mark.exists() else None
+
+    def stop(self, number: int) -> None:
+        """Begin no more jobs, because of a signal."""
+        replace_whole(self.folder / "signal", lambda draft: draft.write_text(str(number)))
+
+    def pass_on(self, number: int) -> bool:
+        """Begin no more jobs, and send a signal to those that other processes of this machine do, if any do."""
+        self.stop(number)
+        told = [entry.process for entry in self.entries() if entry.process is not None]
+        others = [process for host, process in told if host == platform.node() and process != os.getpid()]
+        for process in others:
+            with suppress(OSError):  # it has just ended
+                os.kill(process, number)
+        return bool(others)
 
 
 def show_jobs(jobs: Sequence[Job]) -> None:
@@ -113,7 +149,9 @@ def show_jobs(jobs: Sequence[Job]) -> None:
     ]
     console = Console(width=None if sys.stdout.isatty() else WIDTH)
     console.print(table)
-    for line in (*failures, pages.write(jobs[0].folder.parent)):
+    folder, in_haste = jobs[0].folder.parent, any(results["status"] == "interrupted" for _, results in found)
+    page = f"Page: hno report {shlex.quote(str(folder))}" if in_haste else pages.write(folder)
+    for line in (*failures, page):
         console.print(line, soft_wrap=True, markup=False, highlight=False)
 
 

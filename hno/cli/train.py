@@ -3,30 +3,31 @@
 from __future__ import annotations
 
 import logging
-import shutil
 import sys
 from pathlib import Path
 from typing import Any
 
 import lightning as L
 
-from hno.cli import launch
+from hno.cli import launch, pages
 from hno.cli.arguments import Arguments
-from hno.cli.build import build, check, how_to_train
+from hno.cli.build import build, check, how_to_train, record_of
+from hno.cli.config import configured
 from hno.cli.evaluate import describe, play_starts, unseen_types
 from hno.cli.logs import StepBar, StepLines, label_progress, loggers, use_threads
 from hno.cli.media import publish
-from hno.cli.results import Results, config_hash
-from hno.cli.sections import run_sections
+from hno.cli.results import Results
+from hno.cli.resume import finished, history, in_its_folder, run_folder, take_over, training_hash
+from hno.cli.sections import run_sections, show
 from hno.cli.settings import TrainSettings
 from hno.data.certificates import safe_sets, summaries
 from hno.data.datamodule import GameData
 from hno.data.labels import Request, default_cache, safe_labels_for
 from hno.games.grid import parse_types
-from hno.training.checkpoint import Provenance, check_resumable, find_checkpoint, load_policy, record, same_run
+from hno.training.checkpoint import load_policy
 from hno.training.divergence import DivergedError
 from hno.training.fit import Fitted, fit
-from hno.training.saving import BEST, RESUMED
+from hno.training.saving import BEST
 from hno.training.validation import PROBE, Later
 from hno.types import Extremal
 
@@ -34,12 +35,22 @@ log = logging.getLogger(__name__)
 
 
 def run(given: Arguments) -> int:
-    """`hno train`."""
-    return launch.run(launch.Task("train", check, head, train), given)
+    """`hno train`; of a run that is finished and resumed with nothing new, its results."""
+    task, there = launch.Task("train", check, head, train), in_its_folder(given)
+    if there is not given and "--dry-run" not in given.flags:
+        settings = configured("train", check, there)
+        if settings is not None and (results := finished(settings)):
+            folder = run_folder(str(settings.resume))
+            print(f"The run in {folder} is finished, and nothing is new. trainer.max_steps=<more> trains it on.")
+            show(results, folder)
+            print(pages.write(folder))
+            return 0
+    return launch.run(task, there)
 
 
 def head(settings: TrainSettings) -> dict[str, Any]:
     """What results.json says from the beginning."""
+    kept = history(settings) if settings.resume is not None else {}
     return {
         "game": settings.game.name,
         "operator": settings.operator.name,
@@ -47,8 +58,9 @@ def head(settings: TrainSettings) -> dict[str, Any]:
         "activation": settings.activation["name"],
         "seed": settings.seed,
         "steps": settings.trainer.max_steps,
-        "config_hash": config_hash(settings),
-        "config": settings.model_dump(),
+        "training_hash": training_hash(settings),
+        "config": settings.model_dump(exclude={"resume"}),
+        **kept,
     }
 
 
@@ -70,34 +82,26 @@ def train_operator(settings: TrainSettings, folder: Path, results: Results) -> F
     """Solve labels and train; the folder gets `last.ckpt` and `best.ckpt`, the results how it went and which to use."""
     L.seed_everything(settings.seed, verbose=False)
     use_threads(settings.trainer.threads)
-    architecture, operator, objective, data = build(settings, label_progress())
-    origin = Provenance(settings.operator.name, data.type_list, settings.seed, config_hash(settings))
-    entries, makers = record(data.game, architecture, origin), loggers(settings, folder)
-    resume = None if settings.resume is None else find_checkpoint(settings.resume, RESUMED)
-    if resume is not None:
-        check_resumable(resume, entries, settings.trainer.max_steps)
-    _take_over(resume, folder / BEST)
-
+    built = build(settings, label_progress())
+    _, operator, objective, data = built
+    resume, (*_, now) = take_over(settings.resume, folder), results.content.get("resumed", [{"step": 0}])
+    makers = loggers(settings, folder, now["step"])
     data.setup("fit")
     results.time("labels", data.label_seconds)
     results.update(label_statistics=summaries(data.extremals))
     first, later = validation_starts(settings, data, results)
-    before = results.content["seconds"].get("validation_labels", 0.0)
     bar = StepBar() if sys.stdout.isatty() else StepLines(settings.trainer.print_every)
     try:
         fitted = fit(
-            operator, objective, data, how_to_train(settings), folder, validation=first, later=later, record=entries,
-            loggers=makers, callbacks=[bar], resume=resume,
+            operator, objective, data, how_to_train(settings), folder, validation=first, later=later,
+            record=record_of(settings, built), loggers=makers, callbacks=[bar], resume=resume,
         )  # fmt: skip
     except DivergedError:
         if (folder / BEST).exists():
             results.update(checkpoint=BEST)
         raise
-    solving = results.content["seconds"].get("validation_labels", 0.0) - before  # while validation played
-    results.time("training", fitted.seconds["training"])
-    results.time("validation", fitted.seconds["validation"] - solving)
+    results.content["seconds"] |= {part: round(seconds, 3) for part, seconds in fitted.seconds.items()}
     if fitted.rounds:
-        results.time("added_labels", fitted.seconds["added_labels"])
         results.update(rounds=[found._asdict() for found in fitted.rounds])
     results.update(
         steps=fitted.trainer.global_step,
@@ -113,7 +117,7 @@ def validation_starts(settings: TrainSettings, data: GameData, results: Results)
 
     Of the latter only those that are played first are solved before the training, the others when they are needed.
     """
-    choice, clearance = settings.validation, settings.evaluation.clearance
+    choice, clearance = settings.validation, settings.validation.clearance
     if choice.types is None:
         return safe_sets(data.held_out(), clearance), None
     types = parse_types(data.game, choice.types, key="validation.types")
@@ -129,11 +133,3 @@ def validation_starts(settings: TrainSettings, data: GameData, results: Results)
     first = solve(min(choice.starts, PROBE))
     later = Later(choice.starts * len(types), lambda: solve(choice.starts))
     return first, None if choice.starts <= PROBE else later
-
-
-def _take_over(resume: Path | None, to: Path) -> None:
-    """Go on from the best checkpoint of the run that is resumed; one of another run in our folder goes."""
-    if resume is None or not same_run(best := resume.with_name(BEST), resume):
-        to.unlink(missing_ok=True)
-    elif best.resolve() != to.resolve():
-        shutil.copy2(best, to)

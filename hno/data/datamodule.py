@@ -19,6 +19,7 @@ from hno.data.labels import Report, Request, default_cache, labels_for
 from hno.data.plans import BATCH_SIZES, Collocation, LabelPlan
 from hno.data.sources import Known, Pool, sample_points
 from hno.games import Game
+from hno.processes import stop_if_asked
 from hno.types import (
     Batch,
     Extremal,
@@ -260,9 +261,9 @@ class GameData(L.LightningDataModule):
         first = self.trainer.global_step if self.trainer is not None else 0
         return DataLoader(_Steps(self, first), batch_size=None)
 
-    def val_dataloader(self) -> DataLoader[Sample] | list[Any]:
-        """Held-out labelled rows, in one batch; nothing without labels."""
-        return [] if self.val_rows is None else DataLoader([self.val_rows], batch_size=None)  # type: ignore[arg-type]  # a list is a data set
+    def val_dataloader(self) -> DataLoader[Sample | None]:
+        """Held-out labelled rows, in one batch; None without labels."""
+        return DataLoader([self.val_rows], batch_size=None)  # type: ignore[arg-type]  # a list is a data set
 
 
 class _Steps(IterableDataset[Batch]):
@@ -272,6 +273,7 @@ class _Steps(IterableDataset[Batch]):
     def __iter__(self) -> Iterator[Batch]:
         step = self.first
         while True:
+            stop_if_asked()  # the step before is complete, its losses are logged
             yield self.data.batch(step)
             step += 1
 

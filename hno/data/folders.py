@@ -13,10 +13,12 @@ from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
 
-import filelock
+from filelock import BaseFileLock, FileLock, SoftFileLock, Timeout  # now, not while a lock is held
 
 log = logging.getLogger(__name__)
 
+LOCK = ".lock"
+"""Name of the lock file of a run's folder, which its process holds while it works: the kernel frees it at its end."""
 PATIENCE = 5.0
 """Time after which waiting is announced for the first time, s; each further time it takes twice as long."""
 POLL = 0.5
@@ -36,10 +38,10 @@ def claimed(path: Path, timeout: float = 0.0) -> Iterator[bool]:
     Raises:
         OSError: the file system has no locks.
     """
-    lock: filelock.BaseFileLock = filelock.FileLock(path)
+    lock: BaseFileLock = FileLock(path)
     try:
         lock.acquire(timeout=timeout)
-    except filelock.Timeout:
+    except Timeout:
         yield False
         return
     except OSError as error:
@@ -49,7 +51,7 @@ def claimed(path: Path, timeout: float = 0.0) -> Iterator[bool]:
             error.errno, f"The file system of {path.parent} has no file locks. Choose another folder with $HNO_CACHE"
         ) from error
     try:
-        if not isinstance(lock, filelock.SoftFileLock):  # which says so itself
+        if not isinstance(lock, SoftFileLock):  # which says so itself
             with suppress(OSError):  # a full disk
                 path.write_text(f"{os.getpid()}\n{platform.node()}\n")
         yield True
@@ -81,10 +83,22 @@ class Waiting:
         """Name the lock file and its holder, if it is time to."""
         if time.monotonic() - self.began >= self.patience:
             self.patience *= 2
-            log.warning("Waiting for %s, held by %s.", path, _holder(path))
+            log.warning("Waiting for %s, held by %s.", path, holder(path))
 
 
-def _holder(path: Path) -> str:
+def held(path: Path) -> bool:
+    """Whether some process holds a lock file; also where it cannot be told, for want of locks or permissions."""
+    if not path.exists():
+        return False
+    try:
+        with claimed(path) as ours:
+            return not ours
+    except OSError:
+        return True
+
+
+def holder(path: Path) -> str:
+    """Who holds a lock file."""
     try:
         since = datetime.fromtimestamp(path.stat().st_mtime).astimezone()
         process, host, *_ = path.read_text().splitlines()

@@ -7,7 +7,8 @@ import inspect
 import math
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,7 +24,7 @@ from hno.data.ties import APART, HALVINGS, TIE, tie_states
 from hno.games import Game
 from hno.pontryagin.mesh import label_times
 from hno.pontryagin.solve import Solver, solve
-from hno.pontryagin.threads import cores
+from hno.pontryagin.threads import cores, label_pool
 from hno.types import Status, best_of, of_starts
 
 SOLVER_VERSION = 2
@@ -172,11 +173,12 @@ def labels_for(
     total, done, converged = sum(len(job.x0) - job.have for job in jobs), 0, 0
     if jobs:
         check_room(cache, label_bytes(game, total), f"Labels of {total} start states", "choose another with $HNO_CACHE")
-    for status in _run(game, jobs, settings, workers):
-        done += len(status)
-        converged += int((status == Status.CONVERGED).sum())
-        if report is not None:
-            report(Progress(done, total, converged))
+    with closing(_run(game, jobs, settings, workers)) as solved:  # whatever ends this ends the workers
+        for status in solved:
+            done += len(status)
+            converged += int((status == Status.CONVERGED).sum())
+            if report is not None:
+                report(Progress(done, total, converged))
     for labels in sets:
         labels.write_manifest()
     return StoredLabels(sets, [request.starts for request in requests]), time.perf_counter() - began
@@ -265,7 +267,7 @@ def _jobs(game: Game, labels: LabelSet, request: Request) -> Iterator[_Job]:
             yield _Job(labels, shard, x0, count, request.theta, request.all_equilibria)
 
 
-def _run(game: Game, jobs: Sequence[_Job], settings: Solver, workers: int | None) -> Iterator[Tensor]:
+def _run(game: Game, jobs: Sequence[_Job], settings: Solver, workers: int | None) -> Generator[Tensor, None, None]:
     """The status of every row that was missing, shard by shard; those that other processes solve are waited for."""
     left, waiting = dict(enumerate(jobs)), Waiting()
     while left:
@@ -293,7 +295,7 @@ def _solved(
     workers = min(workers or cores(), len(jobs))
     if workers <= 1:
         return ((number, _solve_shard(game, job, settings)) for number, job in jobs.items())
-    pool = joblib.Parallel(n_jobs=workers, return_as="generator_unordered", inner_max_num_threads=1, backend="loky")
+    pool = label_pool(workers, "generator_unordered")
     return pool(joblib.delayed(_solve_alone)(number, game, job, settings) for number, job in jobs.items())
 
 

@@ -60,9 +60,13 @@ def play(
     for some in _gathered(labels, at_once):
         starts = torch.cat([found.x[:, 0] for found in some]).float()
         types = torch.cat([found.theta for found in some]).float()
-        played = rollout(game, policy, starts, types, dt, disturbance=disturbance)
-        columns = zip(*(column.split([len(found.status) for found in some]) for column in played[1:]), strict=True)
-        yield from ((found, Trajectory(played.t, *paths)) for found, paths in zip(some, columns, strict=True))
+        yield from _apart(some, rollout(game, policy, starts, types, dt, disturbance=disturbance))
+
+
+def _apart(labels: Sequence[Extremal], played: Trajectory) -> Iterator[tuple[Extremal, Trajectory]]:
+    """Each set with its own episodes of those that were played together."""
+    columns = zip(*(column.split([len(found.status) for found in labels]) for column in played[1:]), strict=True)
+    yield from ((found, Trajectory(played.t, *paths)) for found, paths in zip(labels, columns, strict=True))
 
 
 def _gathered(labels: Iterable[Extremal], most: float) -> Iterator[list[Extremal]]:

@@ -68,7 +68,7 @@ class Played(NamedTuple):
     """What is kept of B episodes: numbers without paths, which would not fit into memory for very many."""
 
     label: Extremal
-    """The labels of their starts, without what comes after the first node."""
+    """The labels of their starts, of whose courses only the values at the first node are left."""
     value: Tensor
     """Minus the cost of each player, shape (B, P)."""
     distance: Tensor
@@ -85,9 +85,9 @@ class Played(NamedTuple):
 
 def numbers_of(game: Game, label: Extremal, paths: Trajectory) -> Played:
     """What is kept of episodes that were played from the starts of labels, B rows of each."""
-    kept = {name: getattr(label, name)[:, :1].clone() for name in ("x", "costate", "u", "value", "potential")}
+    none = {name: getattr(label, name)[:, :0].clone() for name in ("x", "costate", "u", "potential")}
     return Played(
-        label._replace(t=label.t[:1], **kept),
+        label._replace(t=label.t[:1], value=label.value[:, :1].clone(), **none),
         paths.value,
         paths.distance,
         paths.collided,

@@ -1,13 +1,16 @@
-"""How many threads torch uses for small work, and how many processes solve labels."""
+"""How many threads torch uses for small work, and the processes that solve labels."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Literal
 
 import joblib
 import torch
+
+from hno.processes import serve
 
 
 def cores() -> int:
@@ -16,6 +19,14 @@ def cores() -> int:
     The fewest that its CPU affinity, its cgroup, Slurm's `--cpus-per-task` and $LOKY_MAX_CPU_COUNT say.
     """
     return min(joblib.cpu_count(), int(os.environ.get("SLURM_CPUS_PER_TASK") or os.cpu_count() or 1))
+
+
+def label_pool(count: int, return_as: Literal["list", "generator_unordered"] = "list") -> joblib.Parallel:
+    """A pool of processes with one thread each, which end with this one, however that ends."""
+    return joblib.Parallel(
+        n_jobs=count, return_as=return_as, inner_max_num_threads=1, backend="loky",
+        initializer=serve, initargs=(os.getpid(),),
+    )  # fmt: skip
 
 
 @contextmanager

@@ -13,11 +13,14 @@ from typing import Any, NamedTuple, TypeVar
 
 from yaml import YAMLError, safe_load  # type: ignore[import-untyped]  # yaml has no annotations
 
+from hno.data.folders import LOCK, held
 from hno.report.episode import episode
 from hno.report.records import Curves, Run, sentence, type_row
 
 T = TypeVar("T")
 RESULTS, METRICS = "results.json", "csv/metrics.csv"
+LOST = {"status": "lost", "reason": "its process ended without a word: it was killed, or its machine failed"}
+"""What results become that still say "running" although no process is at work in their folder."""
 
 
 class NoRunsError(ValueError):
@@ -86,6 +89,7 @@ def _runs(folder: Path, name: str) -> list[Run]:
     if not (folder / RESULTS).exists():
         raise ValueError(f"no {RESULTS}: the job has only begun, or ended before it could write any")
     content = _json(folder / RESULTS)
+    content = content if at_work(folder, content) else {**content, **LOST}
     models = content.pop("models", None) or [{}]
     if not (isinstance(models, list) and all(isinstance(model, dict) for model in models)):
         raise ValueError(f"{RESULTS} is not hno's: models is no list of objects")
@@ -95,6 +99,11 @@ def _runs(folder: Path, name: str) -> list[Run]:
         _run(folder, name, {**(shared if k else content), **model})
         for k, (name, model) in enumerate(zip(names, models, strict=True))
     ]
+
+
+def at_work(folder: Path, content: Mapping[str, Any]) -> bool:
+    """Whether results are what they say: where they say "running", a process holds the lock of their folder."""
+    return content.get("status") != "running" or held(folder / LOCK)
 
 
 def _json(path: Path) -> dict[str, Any]:

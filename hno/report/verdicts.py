@@ -70,6 +70,6 @@ def verdict(recipe: Recipe, recipes: Sequence[Recipe]) -> str:
 
 def why(run: Run) -> str:
     """Why a run has no result."""
-    if run.status == "failed":
-        return run.reason or "failed without a reason"
-    return f"unfinished: its results say {run.status!r}. It is still at work, or was killed."
+    if run.status == "running":
+        return "unfinished: it is still at work."
+    return f"{'' if run.status == 'failed' else f'{run.status}: '}{run.reason or 'it does not say why'}"

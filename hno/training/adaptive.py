@@ -25,7 +25,7 @@ from hno.data.datamodule import mix
 from hno.games import Game
 from hno.pontryagin.online import subgame
 from hno.pontryagin.solve import Solver, solve
-from hno.pontryagin.threads import cores
+from hno.pontryagin.threads import cores, label_pool
 from hno.training.module import TrainingModule
 from hno.types import Extremal, Status, best_of, join, part
 
@@ -179,7 +179,7 @@ class AdaptiveLabels(L.Callback):
         game, x0, theta = subgame(data.game, group.tau), group.x[rows].double(), group.theta[rows].double()
         jobs = list(zip(x0.split(CHUNK), theta.split(CHUNK), strict=True))
         workers = min(self.workers or cores(), len(jobs))
-        pool = joblib.Parallel(n_jobs=workers, inner_max_num_threads=1, backend="loky")
+        pool = label_pool(workers)
         call = joblib.delayed(solve)
         return join(pool(call(game, *job, self.solver, all_equilibria=data.potential) for job in jobs))
 

@@ -36,12 +36,12 @@ FORMAT = 6
 
 @dataclass(frozen=True)
 class Provenance:
-    """Where an operator comes from: its method, its training types, and the hash of what determined its numbers."""
+    """Where an operator comes from: its method, its training types, and the hash of what its training depended on."""
 
     method: str = ""
     types: Sequence[tuple[float, ...]] = ()
     seed: int | None = None
-    config_hash: str = ""
+    training_hash: str = ""
 
 
 def record(game: Game, architecture: Architecture, provenance: Provenance) -> dict[str, Any]:
@@ -170,10 +170,10 @@ def check_resumable(path: str | Path, expected: Mapping[str, Any], steps: int | 
 
     Raises:
         CheckpointError: see `read_checkpoint` and `check_training_state`; or the checkpoint is of another game,
-            operator or configuration.
+            operator or training.
     """
     content = read_checkpoint(path)
-    found, wanted = _flat(content[KEY]), _flat(expected[KEY])
+    found, wanted = flat(content[KEY]), flat(expected[KEY])
     differing = sorted(name for name in found.keys() | wanted.keys() if found.get(name) != wanted.get(name))
     if differing:
         pairs = "; ".join(f"{name} {found.get(name)!r}, expected {wanted.get(name)!r}" for name in differing)
@@ -224,12 +224,12 @@ def same_run(one: Path, other: Path) -> bool:
     return False
 
 
-def _flat(content: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def flat(content: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Nested mappings as one, with dotted names."""
-    flat: dict[str, Any] = {}
+    found: dict[str, Any] = {}
     for name, value in content.items():
-        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {prefix + name: value}
-    return flat
+        found |= flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {prefix + name: value}
+    return found
 
 
 def load_operator(path: str | Path, game: str | None = None) -> tuple[ValueOperator, Architecture, Provenance]:

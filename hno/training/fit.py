@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,12 +17,15 @@ from hno.data.certificates import safe_sets
 from hno.data.folders import check_room
 from hno.losses import Objective, Scales
 from hno.operators import ValueOperator
+from hno.processes import stop_if_asked, waiting_signals
 from hno.training.adaptive import Adaptive, AdaptiveLabels, Round
 from hno.training.checkpoint import check_training_state, same_run
 from hno.training.divergence import StopOnDivergence
+from hno.training.interruption import SaveOnSignal
+from hno.training.logbook import Logbook
 from hno.training.module import TrainingModule
 from hno.training.optimizers import make_optimizer
-from hno.training.polish import polish
+from hno.training.polish import Polish
 from hno.training.quiet import quiet_lightning
 from hno.training.saving import BEST, LAST, UNFIT, CheckpointError, CheckpointFiles, read_content, reason, remove_drafts
 from hno.training.validation import ClosedLoopValidation, Later, Score
@@ -44,6 +45,8 @@ class Settings:
     """How an operator is trained: a field for every choice, all with defaults."""
 
     steps: int = 2000
+    schedule_steps: int | None = None
+    """Steps over which the rate falls and labels are added; `steps` by default. Those beyond keep the final rate."""
     optimizer: Mapping[str, Any] = field(default_factory=lambda: {"name": "soap"})
     """Name and options, see `hno.training.optimizers.make_optimizer`."""
     validate_every: int = 500
@@ -64,6 +67,11 @@ class Settings:
     """Labels that are added while training."""
     compile: bool = True
     """`torch.compile` in runs of at least `LONG` steps."""
+
+    @property
+    def planned(self) -> int:
+        """Steps over which everything that changes with them is laid out."""
+        return self.schedule_steps or self.steps
 
     def __post_init__(self) -> None:
         """Refuse, with a ValueError, a precision in which simulation and residuals would be wrong."""
@@ -90,7 +98,8 @@ class Fitted(NamedTuple):
     rounds: list[Round]
     """What was labelled while training."""
     seconds: dict[str, float]
-    """Time spent on training, on validation and on labels that were added, if any, s."""
+    """Time spent on training, on validation without its labels, and on labels that were added, if any, s; by runs that
+    this one goes on from too."""
 
 
 @quiet_lightning()
@@ -134,9 +143,9 @@ def fit(
             f"The operator learns {_LEARNED[operator.potential]}, the data label {_LEARNED[data.potential]}: make them "
             "alike with GameData(potential=operator.potential)."
         )
-    optimizer = make_optimizer(steps=settings.steps, **settings.optimizer)
+    optimizer = make_optimizer(steps=settings.planned, **settings.optimizer)
     module = TrainingModule(operator, objective, optimizer, record)
-    if settings.compile and settings.steps >= LONG:
+    if settings.compile and settings.planned >= LONG:
         operator.compile_kernels()
     data.setup("fit")
     if objective.scaled:
@@ -146,35 +155,29 @@ def fit(
     watch = ClosedLoopValidation(folder, settings.validate_every, dt=settings.dt, stop=settings.stop_when_safe)
     watch.begin(safe_sets(data.held_out()) if validation is None else validation, later)
     plan = data.labels
-    adding = AdaptiveLabels(settings.adaptive, settings.steps, data.seed, settings.dt, plan.solver, plan.workers)
-    trainer = make_trainer(settings, folder, loggers, [adding, watch, *callbacks], validates=data.val_rows is not None)
+    adding = AdaptiveLabels(settings.adaptive, settings.planned, data.seed, settings.dt, plan.solver, plan.workers)
+    logbook = Logbook()
+    own = [adding, watch, Polish(settings.polish, watch), logbook]
+    trainer = make_trainer(settings, folder, loggers, [*own, *callbacks])
     remove_drafts(folder)
     if resume is not None:
         check_training_state(resume, read_content(resume), settings.steps)
         watch.resumes = same_run(folder / BEST, resume)
     _check_room(folder, operator)
-    began = time.perf_counter()
     try:
-        trainer.fit(module, datamodule=data, ckpt_path=resume, weights_only=True)
+        with waiting_signals():
+            trainer.fit(module, datamodule=data, ckpt_path=resume, weights_only=True)
     except UNFIT as error:
         if resume is None or module.began:
             raise
         raise CheckpointError(f"{resume} does not fit this run: {reason(error)}") from error
-    if settings.polish:
-        before, after = polish(module, data.large_batch(trainer.global_step), settings.polish)
-        log.info("L-BFGS: loss %.4g, was %.4g", after, before)
-        watch.consider(trainer, module)
-    # The callback saves at multiples of `validate_every`, which the last step need not be.
-    trainer.save_checkpoint(folder / LAST, weights_only=False)
+    stop_if_asked()
     added = sum(found.seconds for found in adding.done)
-    training = time.perf_counter() - began - watch.seconds - added
-    seconds = {"training": training, "validation": watch.seconds} | ({"added_labels": added} if adding.done else {})
-    logged = {name: float(value) for name, value in trainer.callback_metrics.items() if name.startswith("loss/")}
-    metrics = {name: loss for name, loss in logged.items() if not math.isnan(loss)}
-    if data.val_rows is not None:
-        metrics |= trainer.validate(module, datamodule=data, verbose=False)[0]
+    training = logbook.seconds - watch.seconds - added
+    seconds = {"training": training, "validation": watch.seconds - watch.solving}
+    seconds |= {"added_labels": added} if adding.done else {}
     checkpoint = folder / (LAST if watch.best is None else BEST)  # a best one of another run does not count
-    return Fitted(trainer, checkpoint, metrics, watch.best, adding.done, seconds)
+    return Fitted(trainer, checkpoint, logbook.metrics, watch.best, adding.done, seconds)
 
 
 def _check_room(folder: Path, operator: ValueOperator) -> None:
@@ -184,16 +187,17 @@ def _check_room(folder: Path, operator: ValueOperator) -> None:
 
 
 def make_trainer(
-    settings: Settings, folder: Path, loggers: Sequence[Logger], callbacks: Sequence[L.Callback], *, validates: bool
+    settings: Settings, folder: Path, loggers: Sequence[Logger], callbacks: Sequence[L.Callback]
 ) -> L.Trainer:
-    """A trainer that runs for a number of steps and leaves `last.ckpt`; it validates where there are held-out rows.
+    """A trainer that runs for a number of steps and leaves `last.ckpt`, of what is validated every so often.
 
     Raises:
         ValueError: there is no such accelerator or precision, or there are several devices.
     """
     every, files = settings.validate_every, CheckpointFiles()
+    # After a validation, when the step is over and in the curves: what goes on from there lacks and repeats nothing.
     keeping_last = ModelCheckpoint(
-        folder, Path(LAST).stem, every_n_train_steps=every, save_on_train_epoch_end=False, enable_version_counter=False
+        folder, Path(LAST).stem, every_n_epochs=1, save_on_train_epoch_end=False, enable_version_counter=False
     )
     trainer = L.Trainer(
         accelerator=settings.accelerator,
@@ -202,13 +206,12 @@ def make_trainer(
         max_steps=settings.steps,
         max_epochs=-1,
         gradient_clip_val=settings.gradient_clip_val,
-        val_check_interval=min(every, settings.steps),
-        limit_val_batches=None if validates else 0,  # Lightning warns of a loader without rows
+        val_check_interval=every,
         check_val_every_n_epoch=None,
         num_sanity_val_steps=0,
-        log_every_n_steps=max(1, min(50, settings.steps)),
+        log_every_n_steps=max(1, min(50, settings.planned)),
         logger=list(loggers) or False,
-        callbacks=[StopOnDivergence(folder, files), *callbacks, keeping_last],
+        callbacks=[StopOnDivergence(folder, files), SaveOnSignal(folder), *callbacks, keeping_last],
         plugins=[files],
         enable_progress_bar=any(isinstance(callback, ProgressBar) for callback in callbacks),
         enable_model_summary=False,

@@ -97,8 +97,10 @@ class TrainingModule(L.LightningModule):
         worst = torch.stack(found).amax(0)
         return sample.rows(worst.topk(max(1, round(share * len(worst)))).indices)
 
-    def validation_step(self, sample: Sample, batch_idx: int) -> None:
-        """Weighted absolute percentage errors of values and costates on held-out labels."""
+    def validation_step(self, sample: Sample | None, batch_idx: int) -> None:
+        """Weighted absolute percentage errors of values and costates on held-out labels, if there are any."""
+        if sample is None:
+            return
         if sample.labels is None:
             raise ValueError("Validation needs labelled rows; this sample has points only.")
         field = self.operator.field(sample.points, sample.types)

@@ -11,6 +11,7 @@ EXPECTED = (
     ".*exists and is not empty",  # results.json is there first, on purpose
     ".*isinstance.treespec, LeafSpec.",  # Lightning's own, from torch 2.13 on
     ".*does not have many workers",  # batches are made in memory
+    ".*dirpath has changed",  # a run goes on in another folder
 )
 """Warnings of Lightning that mean nothing here."""
 

@@ -94,8 +94,14 @@ class ClosedLoopValidation(L.Callback):
         self.all: Starts | None = None
         self.later: Later | None = None
         self.best: Score | None = None
+        self.found: Score | None = None
         self.resumes = True
-        self.seconds = 0.0
+        self.seconds = self.solving = 0.0
+
+    @property
+    def satisfied(self) -> bool:
+        """Whether the training is to end because no start collided."""
+        return self.stop and self.best is not None and self.best.collision_rate == 0
 
     def begin(self, labels: Sequence[Extremal], later: Later | None = None) -> None:
         """Play from the starts of these labels, which are safe, one set per type; without any, play nothing.
@@ -108,16 +114,23 @@ class ClosedLoopValidation(L.Callback):
         self.all, self.later = starts_of(labels), later
         self.probe = starts_of([part(found, slice(self.count)) for found in labels])
 
+    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """A run that had ended is not trained on."""
+        trainer.should_stop |= self.satisfied
+
     def on_train_batch_end(
         self, trainer: L.Trainer, pl_module: L.LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         """Validate where it is time to."""
         assert isinstance(pl_module, TrainingModule)
         due = trainer.global_step % self.every == 0 or trainer.global_step == trainer.max_steps
-        found = self.consider(trainer, pl_module) if due else None
-        if found is not None:
-            pl_module.log_dict({f"closed_loop/{name}": value for name, value in found._asdict().items()})
-            trainer.should_stop |= self.stop and found.collision_rate == 0
+        self.found = self.consider(trainer, pl_module) if due else None
+        trainer.should_stop |= self.satisfied
+
+    def on_validation_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Log what was found, beside the errors on held-out labels."""
+        if self.found is not None:
+            pl_module.log_dict({f"closed_loop/{name}": value for name, value in self.found._asdict().items()})
 
     def consider(self, trainer: L.Trainer, module: TrainingModule) -> Score | None:
         """Play, if there are starts, and write `best.ckpt` if nothing was better so far."""
@@ -144,7 +157,9 @@ class ClosedLoopValidation(L.Callback):
             hits = found.collision_rate * len(probe.cost)
             return found._replace(collision_rate=(hits + count - len(probe.cost)) / count)
         if self.later is not None:
+            began = time.perf_counter()
             self.all, self.later = starts_of(self.later.solve()), None
+            self.solving += time.perf_counter() - began
             starts = self.all.like(like)
         if len(starts.cost) == len(probe.cost):
             return found
@@ -159,9 +174,11 @@ class ClosedLoopValidation(L.Callback):
         self.seconds += time.perf_counter()
 
     def state_dict(self) -> dict[str, Any]:
-        """The best score so far."""
-        return {"best": None if self.best is None else list(self.best)}
+        """The best score so far, and how long it took, without and with labels."""
+        best = None if self.best is None else list(self.best)
+        return {"best": best, "seconds": self.seconds, "solving": self.solving}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Go on from it, where the checkpoint that it belongs to is there and is to be used (`resumes`)."""
+        self.seconds, self.solving = float(state_dict["seconds"]), float(state_dict["solving"])
         self.best = Score(*state_dict["best"]) if state_dict["best"] and self.resumes and self.path.exists() else None

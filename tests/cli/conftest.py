@@ -7,7 +7,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import pytest
 import torch
@@ -77,19 +77,27 @@ def command(
     clean_globals: None,
     no_pages: None,
 ) -> Command:
-    """Run a command in this process, as the command line would, but without pictures and pages."""
+    """Run a command in this process, as the command line would, but without pictures and pages.
+
+    It gets a folder of its own, but for a run that is resumed: the one before.
+    """
     monkeypatch.setattr(evaluate, "draw_typical", lambda *arguments: None)
 
-    def run(name: str, *words: str, folder: Path = tmp_path / "run") -> Outcome:
+    folders = [tmp_path / "run"]
+
+    def run(name: str, *words: str, folder: Path | Literal["own", "none"] = "own") -> Outcome:
+        if folder == "own" and folders[-1].exists() and not any(word.startswith("resume=") for word in words):
+            folders.append(tmp_path / f"run_{len(folders) + 1}")
+        chosen = folder if isinstance(folder, Path) else folders[-1]
         monkeypatch.setattr(sys, "argv", [name])
         capsys.readouterr()
-        to = [f"hydra.run.dir={folder}"] if name in ("train", "evaluate") else []
+        to = [f"hydra.run.dir={chosen}"] if name in ("train", "evaluate") and folder != "none" else []
         code: int | str | None
         try:
             code = main([name, *words, *to])
         except SystemExit as stop:  # Lightning's, after an interruption
             code = stop.code
-        return Outcome(int(code or 0), "".join(capsys.readouterr()), folder)
+        return Outcome(int(code or 0), "".join(capsys.readouterr()), chosen)
 
     return run
 

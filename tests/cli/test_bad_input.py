@@ -201,18 +201,17 @@ def test_a_label_file_that_was_moved_away_is_solved_again(command: Command, own_
 
 
 @pytest.mark.usefixtures("no_labels")
-def test_resuming_from_something_else(command: Command, tmp_path: Path, random_checkpoint: Path) -> None:
-    before = random_checkpoint.read_bytes()
-    refused(command("train", *SMOKE, "resume=/nowhere/last.ckpt"), "There is no checkpoint at /nowhere/last.ckpt")
-    refused(command("train", *SMOKE, "game=drone", f"resume={random_checkpoint}"), "'narrow_road', expected 'drone'")
-    refused(command("train", *SMOKE, "network.width=8", f"resume={random_checkpoint}"), "architecture.network.options")
+def test_resuming_from_what_is_no_run(command: Command, tmp_path: Path, random_checkpoint: Path) -> None:
+    before, foreign = random_checkpoint.read_bytes(), tmp_path / "foreign.ckpt"
     (tmp_path / "empty").mkdir()
-    refused(
-        command("train", *SMOKE, f"resume={tmp_path}/empty"), f"There is no checkpoint at {tmp_path}/empty/last.ckpt"
-    )
-    foreign = tmp_path / "foreign.ckpt"
     foreign.write_bytes(b"these are no weights")
-    refused(command("train", *SMOKE, f"resume={foreign}"), "not a readable checkpoint")
+    for place, said in (
+        ("/nowhere/last.ckpt", "There is no checkpoint at /nowhere."),
+        (tmp_path / "empty", f"There is no checkpoint at {tmp_path}/empty/last.ckpt"),
+        (foreign, f"There is no run to go on with in {foreign}"),
+        (random_checkpoint, f"There is no run to go on with in {random_checkpoint.parent}"),
+    ):
+        refused(command("train", *SMOKE, f"resume={place}"), said)
     assert random_checkpoint.read_bytes() == before
 
 

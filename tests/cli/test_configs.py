@@ -12,7 +12,7 @@ from hno.cli.build import build, check
 from hno.cli.calls import train_settings
 from hno.cli.config import choices, compose, config_dir, for_hydra, groups, register_plugins
 from hno.cli.main import main
-from hno.cli.results import config_hash
+from hno.cli.resume import training_hash
 from hno.cli.settings import TrainSettings
 from hno.data import GameData
 from hno.data.exchange import write_own
@@ -162,10 +162,11 @@ def test_paper_recipe_is_the_published_one() -> None:
 
 
 def test_hash_names_what_determines_the_numbers() -> None:
-    base = config_hash(settings())
-    assert config_hash(settings()) == base
-    for same in ("logger=csv", "data.cache=/some", "data.workers=1", "trainer.threads=1"):
-        assert config_hash(settings(same)) == base
+    base = training_hash(settings())
+    assert training_hash(settings()) == base
+    free = "logger=csv", "data.cache=/some", "data.workers=1", "trainer.threads=1", "evaluation.starts=3"
+    for same in (*free, "trainer.accelerator=cpu"):
+        assert training_hash(settings(same)) == base
     for other in (
         "seed=1",
         "game=drone",
@@ -175,7 +176,7 @@ def test_hash_names_what_determines_the_numbers() -> None:
         "optimizer.lr=1e-4",
         "data.trajectories=8",
     ):
-        assert config_hash(settings(other)) != base
+        assert training_hash(settings(other)) != base
 
 
 def test_configuration_is_found_beside_the_package() -> None:

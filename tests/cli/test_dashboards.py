@@ -67,7 +67,7 @@ def test_csv_and_tensorboard_together_get_numbers_and_pictures(command: Command)
     assert "loss/total" not in wanted
     assert "loss/total" in scalars
     chosen = found.PluginTagToContent("hparams")["_hparams_/session_start_info"]
-    assert all(part in chosen for part in (b"narrow_road", b"hno", b"potential", b"sin", b"config_hash"))
+    assert all(part in chosen for part in (b"narrow_road", b"hno", b"potential", b"sin", b"training_hash"))
     assert found.Tags()["images"] == ["collision_map"]
     assert found.Images("collision_map")[0].encoded_image_string.startswith(b"\x89PNG")
 

@@ -66,7 +66,7 @@ def test_both_functions_in_one_sweep(command: Command, tmp_path) -> None:
     assert [(job.results["status"], job.results["function"]) for job in jobs] == [
         ("finished", "value"), ("finished", "potential"),
     ]  # fmt: skip
-    assert len({job.results["config_hash"] for job in jobs}) == 2
+    assert len({job.results["training_hash"] for job in jobs}) == 2
     policies = [hno.load_policy(job.folder / "last.ckpt") for job in jobs]
     assert [policy.names()["function"] for policy in policies] == ["value", "potential"]
     assert [policy.operator.potential for policy in policies] == [False, True]

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import functools
 import sys
 from collections.abc import Callable
 from concurrent.futures.process import BrokenProcessPool
@@ -16,6 +17,7 @@ from hno.data.labels import Request, label_set
 from hno.data.shards import SHARD
 from hno.games import Game, make
 from hno.pontryagin.solve import Solver
+from hno.processes import Interrupted
 from hno.types import Extremal, Status
 from tests.data import conftest
 from tests.data.conftest import Asked
@@ -221,7 +223,7 @@ def test_a_damaged_shard_is_moved_aside_and_solved_again(generate: Generate, fol
 @pytest.mark.parametrize(
     ("accident", "code", "message"),
     [
-        (KeyboardInterrupt, 130, "the same command goes on from here"),
+        (functools.partial(Interrupted, 2), 130, "the same command goes on from here"),
         (BrokenProcessPool, 1, "Finished shards are kept: try fewer workers"),
     ],
 )
@@ -230,7 +232,7 @@ def test_finished_shards_survive_an_accident(
     monkeypatch: pytest.MonkeyPatch,
     folder: Path,
     asked: Asked,
-    accident: type[BaseException],
+    accident: Callable[[], BaseException],
     code: int,
     message: str,
 ) -> None:
@@ -238,7 +240,7 @@ def test_finished_shards_survive_an_accident(
 
     def interrupted(game: Game, x0: Tensor, theta: Tensor, settings: Solver, *, all_equilibria: bool) -> Extremal:
         if asked.total() >= 2 * SHARD:
-            raise accident
+            raise accident()
         return solver(game, x0, theta, settings, all_equilibria=all_equilibria)
 
     with monkeypatch.context() as patch:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from hno.cli.main import main
+from hno.data.folders import LOCK, claimed
 from hno.report.runs import load
 from tests.report.folders import GRID5, make_results, write_run
 
@@ -92,7 +93,8 @@ def test_watching_follows_the_sweep_and_leaves_a_page_at_rest(tmp_path, monkeypa
 
 def test_a_run_that_goes_on_is_read_again(tmp_path):
     write_run(tmp_path / "0", {**RESULTS, "status": "running"}, extras=False)
-    assert load(tmp_path).runs[0].status == "running"
+    with claimed(tmp_path / "0" / LOCK):
+        assert load(tmp_path).runs[0].status == "running"
     os.utime(tmp_path / "0" / "results.json", ns=(1, 1))
     write_run(tmp_path / "0", RESULTS, extras=False)
     assert load(tmp_path).runs[0].status == "finished"

@@ -30,7 +30,7 @@ from tests.fakes import fake_labels
 
 GAMES, OPERATORS, ACTIVATIONS = ("narrow_road", "lane_change", "drone"), ("hno", "sno"), ("tanh", "sin", "relu")
 KEYS = {
-    "status", "reason", "game", "operator", "activation", "seed", "steps", "config_hash", "seconds", "table",
+    "status", "reason", "game", "operator", "activation", "seed", "steps", "training_hash", "seconds", "table",
     "versions", "config", "episodes",
 }  # fmt: skip
 """Entries of results.json that are there however a run ends."""
@@ -195,7 +195,7 @@ def test_an_interrupted_run_says_so(command: Command) -> None:
     with power_cut(KeyboardInterrupt()):
         run = command("train", *SIX)
     assert run.code != 0
-    assert (run.results["status"], run.results["reason"]) == ("failed", "interrupted")
+    assert (run.results["status"], run.results["reason"]) == ("interrupted", "SIGINT")
 
 
 @pytest.mark.parametrize("activation", ACTIVATIONS)
@@ -206,7 +206,7 @@ def test_same_seed_same_weights(command: Command, tmp_path: Path, activation: st
     again = command("train", *recipe, folder=tmp_path / "again")
     assert equal(weights(first.folder), weights(again.folder))
     assert first.results["table"] == again.results["table"]
-    assert first.results["config_hash"] == again.results["config_hash"]
+    assert first.results["training_hash"] == again.results["training_hash"]
 
 
 def test_other_seed_other_weights(command: Command, tmp_path: Path) -> None:

@@ -52,16 +52,22 @@ def written(path: Path, seconds: float = 20.0) -> list[Record]:
         time.sleep(0.05)
 
 
+def history_of(path: Path) -> list[dict[str, Any]]:
+    """Rows that a run logged, as far as they were written."""
+    found = [Record.FromString(message) for message in messages(path.read_bytes())]
+    return [
+        {item.key or "/".join(item.nested_key): json.loads(item.value_json) for item in record.history.item}
+        for record in found
+        if record.HasField("history")
+    ]
+
+
 def offline_run(folder: Path) -> OfflineRun:
     """The one offline run of a run folder."""
     (path,) = folder.glob("wandb/offline-run-*/run-*.wandb")
     found = written(path)
     (run,) = (record.run for record in found if record.HasField("run"))
-    history = [
-        {item.key or "/".join(item.nested_key): json.loads(item.value_json) for item in record.history.item}
-        for record in found
-        if record.HasField("history")
-    ]
+    history = history_of(path)
     summary = {key: value for row in history for key, value in row.items()}
     for record in found:
         if record.HasField("summary"):

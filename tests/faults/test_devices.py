@@ -19,13 +19,13 @@ command, no_labels, clean_globals, no_pages = (
 def test_a_program_trains_on_one_device(devices: int | str, tmp_path: Path) -> None:
     settings = Settings(accelerator="cpu", devices=devices)
     with pytest.raises(ValueError, match=rf"asks for {devices} devices; a run trains on one"):
-        make_trainer(settings, tmp_path, [], [], validates=False)
+        make_trainer(settings, tmp_path, [], [])
 
 
 @pytest.mark.parametrize("devices", [1, "1", "auto"])
 def test_one_device_is_taken(devices: int | str, tmp_path: Path) -> None:
     settings = Settings(accelerator="cpu", devices=devices)
-    assert make_trainer(settings, tmp_path, [], [], validates=False).world_size == 1
+    assert make_trainer(settings, tmp_path, [], []).world_size == 1
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,7 @@ import safetensors
 import torch
 
 from hno.cli import evaluate, pages
+from hno.cli.curve import CurveLogger
 from hno.cli.results import Results
 from hno.data import folders
 from hno.data.labels import Request, label_bytes, label_set, labels_for
@@ -129,6 +130,20 @@ def test_a_page_that_does_not_fit_leaves_the_one_that_was_there(place: Path) -> 
     assert re.search(r"report\.html could not be written .*what was there before is whole", line)
     assert "\n" not in line
     assert files(place) == before
+
+
+def test_a_curve_that_does_not_fit_keeps_its_rows(place: Path) -> None:
+    curve = CurveLogger(place / "metrics.csv")
+    for step in range(3):
+        curve.log_metrics({"loss": 0.5}, step)
+    before = files(place)
+    fill(place, 4096 if os.path.ismount(place) else len(before["metrics.csv"]) + 3)
+    wide = {f"loss/{number}": 0.5 for number in range(2000)}
+    for row in (wide, {"loss": "5" * 9000}):  # a file with more columns, and one more row
+        curve.columns = ["loss", "step"]
+        with pytest.raises(OSError, match=r"metrics\.csv could not be written .*what was there before is whole"):
+            curve.log_metrics(row, 3)
+        assert files(place) == before
 
 
 def test_a_set_that_does_not_fit_keeps_its_shards(place: Path, asked: Asked) -> None:

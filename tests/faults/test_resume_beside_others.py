@@ -8,7 +8,7 @@ import lightning as L
 import pytest
 import torch
 
-from hno.cli.train import _take_over as take_over
+from hno.cli.resume import take_over
 from hno.training.checkpoint import find_checkpoint, same_run
 from hno.training.saving import BEST, LAST, PREVIOUS, RESUMED, read_content, seal
 from tests.faults.checkpoints import EVERY, operator_content, run, trained
@@ -41,7 +41,7 @@ def test_a_best_checkpoint_that_is_not_of_the_run_is_not_used(
     best.write_bytes({"empty": b"", "truncated": whole[:-9]}.get(what, seal(content)))
     found = run(folder, resume=last)
     assert (found.best, found.checkpoint) == (None, last)
-    take_over(last, best)
+    take_over(str(last), folder)
     assert not best.exists()
     stranger = f"{best} is of another run than {last} and is not used."
     damaged = f"{best} is not a readable checkpoint: "
@@ -52,9 +52,9 @@ def test_a_best_checkpoint_that_is_not_of_the_run_is_not_used(
 def test_the_best_checkpoint_of_the_run_goes_along(folder: Path, tmp_path: Path) -> None:
     to = tmp_path / "to" / BEST
     to.parent.mkdir()
-    take_over(folder / LAST, to)
+    take_over(str(folder / LAST), to.parent)
     assert to.read_bytes() == (folder / BEST).read_bytes()
-    take_over(None, to)
+    take_over(None, to.parent)
     assert not to.exists()
 
 

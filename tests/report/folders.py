@@ -90,7 +90,7 @@ def make_results(
     return {
         "status": "finished", "reason": None, "game": game, "operator": operator, "function": "value",
         "activation": activation,
-        "seed": seed, "steps": 2000, "config_hash": "0" * 16, "checkpoint": "best.ckpt",
+        "seed": seed, "steps": 2000, "training_hash": "0" * 16, "checkpoint": "best.ckpt",
         "seconds": {"labels": 36.0, "training": round(50 + 20 * rng.random(), 1), "validation": 6.0, "evaluation": 8.0},
         "metrics": {"loss/total": 0.05, "val/value_error": 0.02, "val/costate_error": 0.04},
         "validation": {"collision_rate": 0.0, "excess": -0.008}, "config": config,
@@ -152,7 +152,7 @@ def write_episodes(folder: Path, results: dict[str, Any], rng: np.random.Generat
 
 
 def write_sweep(root: Path, count: int, *, types: Any = GRID5) -> Path:
-    """A sweep of finished runs with one that failed and one that is running."""
+    """A sweep of finished runs with one that failed and one that was lost."""
     recipes = list(itertools.product(GAMES, OPERATORS, ACTIVATIONS))
     for job in range(count):
         game, operator, activation = recipes[job % len(recipes)]

@@ -36,7 +36,7 @@ def test_a_whole_run_is_read_without_remarks(tmp_path):
 def test_a_sweep_says_what_it_is(tmp_path):
     sweep = load(write_sweep(tmp_path, 4))
     assert sweep.command.startswith("python train.py -m game=narrow_road,lane_change,drone operator=hno,sno")
-    assert [run.status for run in sweep.runs] == ["finished", "finished", "running", "failed"]
+    assert [run.status for run in sweep.runs] == ["finished", "finished", "lost", "failed"]
 
 
 def test_jobs_are_in_the_order_of_their_numbers(tmp_path):

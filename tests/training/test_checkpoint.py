@@ -237,7 +237,7 @@ def test_resuming_asks_for_the_same_game_operator_network_and_origin(make_operat
         (record(game, architecture("sin"), ORIGIN), "'tanh', expected 'sin'"),
         (record(game, architecture(), replace(ORIGIN, method="sno")), "method 'hno', expected 'sno'"),
         (record(game, architecture(), replace(ORIGIN, seed=8)), "seed 7, expected 8"),
-        (record(game, architecture(), replace(ORIGIN, config_hash="another")), "config_hash"),
+        (record(game, architecture(), replace(ORIGIN, training_hash="another")), "training_hash"),
     ):
         with pytest.raises(CheckpointError, match=f"{differs}.*Resume with its own configuration"):
             check_resumable(path, other)

@@ -274,7 +274,7 @@ def test_a_validation_without_starts_rests(make_validation: Build, walking: Walk
         callback.on_train_batch_end(trainer, walking(straight), None, None, 0)
         callback.begin([])
     assert list(tmp_path.iterdir()) == []
-    assert callback.state_dict() == {"best": None}
+    assert callback.state_dict() == {"best": None, "seconds": 0.0, "solving": 0.0}
 
 
 def test_it_plays_every_so_often_and_at_the_end(
@@ -393,6 +393,7 @@ def test_what_was_found_is_logged(make_validation: Build, walking: Walking, monk
     monkeypatch.setattr(TrainingModule, "log_dict", lambda self, values, **kwargs: told.append(values))
     callback.begin([labelled([SAFE, CLOSE], excess=0.5)])
     callback.on_train_batch_end(trainer, module, None, None, 0)
+    callback.on_validation_epoch_end(trainer, module)
     assert told == [{"closed_loop/collision_rate": 0.5, "closed_loop/excess": pytest.approx(0.5, abs=1e-3)}]
     assert 0 < callback.seconds < 60
 

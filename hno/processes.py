@@ -1,0 +1,158 @@
+"""How processes end: a signal becomes an exception where nothing is half done, and workers go with their parent."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1") if hasattr(signal, name)]
+"""Those that ask a process to end; Slurm sends SIGTERM, or SIGUSR1 where it is told to, before it takes a node back."""
+GRACE = 5.0
+"""Time that a step under way has to come to its end, s."""
+SAME = 1.0
+"""Time in which several signals are one, s: of a terminal and of a parent, say."""
+
+
+class Interrupted(BaseException):
+    """A signal asks this process to end; no `KeyboardInterrupt`, of which libraries make what they like.
+
+    Args:
+        number: of the signal.
+        between: whether it was waited with until nothing was half done.
+    """
+
+    def __init__(self, number: int, between: bool = False) -> None:
+        super().__init__(number, between)
+        self.number, self.between = number, between
+
+    def __str__(self) -> str:
+        """The signal's name."""
+        return signal.Signals(self.number).name
+
+    @property
+    def code(self) -> int:
+        """The exit code that shells give to a process that a signal ended."""
+        return 128 + self.number
+
+
+class _State:
+    """What this process was asked, and how it answers."""
+
+    number: int | None = None
+    """The first signal."""
+    since = 0.0
+    """When it came, s."""
+    taken = False
+    """Whether signals are this module's."""
+    waits = False
+    """Whether it waits for `stop_if_asked`."""
+    tell: Callable[[int], bool] | None = None
+    """Passes a signal on to other processes; whether any of them is to end first."""
+
+
+def _answer(number: int, frame: FrameType | None) -> None:
+    again = _State.number is not None
+    if again and time.monotonic() - _State.since < SAME:
+        return
+    if not again:
+        _State.number, _State.since = number, time.monotonic()
+        if _State.waits:
+            signal.setitimer(signal.ITIMER_REAL, GRACE)
+            return
+        if _State.tell is not None and _State.tell(number):
+            return
+    raise Interrupted(_State.number or number)
+
+
+def _lose_patience(number: int, frame: FrameType | None) -> None:
+    raise Interrupted(_State.number or number)
+
+
+def stop_if_asked() -> None:
+    """Raise `Interrupted` if a signal came; called where nothing is half done."""
+    if _State.number is not None:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        raise Interrupted(_State.number, between=True)
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """Let signals raise `Interrupted` in a block of the main thread.
+
+    Those that are ignored stay so (under nohup, or in the background of a script).
+    """
+    if _State.taken or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    numbers = [*SIGNALS, signal.SIGALRM]
+    before = {number: signal.getsignal(number) for number in numbers}
+    _State.number = None
+    _State.taken = True
+    _take_signals()
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        _State.number, _State.taken = None, False
+        for number, handler in before.items():
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)
+
+
+def take_back_signals() -> None:
+    """Take signals from a library that put itself before this module, inside `interruptible`."""
+    if _State.taken:
+        _take_signals()
+
+
+def _take_signals() -> None:
+    for number in SIGNALS:
+        if signal.getsignal(number) != signal.SIG_IGN:
+            signal.signal(number, _answer)
+    signal.signal(signal.SIGALRM, _lose_patience)
+
+
+@contextmanager
+def waiting_signals() -> Iterator[None]:
+    """Let a signal wait for the next `stop_if_asked`, for `GRACE` at most."""
+    _State.waits = True
+    try:
+        yield
+    finally:
+        _State.waits = False
+
+
+@contextmanager
+def passed_on(tell: Callable[[int], bool]) -> Iterator[None]:
+    """Pass a signal on; where another process is to end first, this one waits for it, until a second signal.
+
+    Args:
+        tell: passes it on, and says whether any process took it.
+    """
+    _State.tell = tell
+    try:
+        yield
+    finally:
+        _State.tell = None
+
+
+def serve(parent: int) -> None:
+    """Begin a worker process: signals are its parent's matter, but for SIGTERM, and it ends when its parent is gone.
+
+    Args:
+        parent: its process id.
+    """
+    for number in SIGNALS:
+        if number != signal.SIGTERM:
+            signal.signal(number, signal.SIG_IGN)
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(0.5)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
