@@ -145,6 +145,8 @@ def test_a_checkpoint_is_exported_and_evaluated(tmp_path: Path, capsys: pytest.C
     options = {"theta": "1,1", "starts": TEST.starts, "seed": TEST.seed, "dt": 0.1}
     exported, own = (hno.evaluate(path, settings=options)["table"] for path in (folder, tmp_path / "best.ckpt"))
     assert exported[0]["collisions"] == own[0]["collisions"]
+    with pytest.raises(ValueError, match="name its checkpoint"):
+        hno.evaluate(folder, settings={"ntk": True, **options})
     assert exported[0]["value_error"] == pytest.approx(own[0]["value_error"], rel=1e-4)
 
 
