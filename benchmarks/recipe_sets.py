@@ -62,11 +62,15 @@ HNO = f"operator=hno {TO_THE_END}"
 HARDENING = f"{HNO} loss.terms.residual=null loss.weights.residual=null ++loss.weights.annealed=0.02"
 FINISHED = "operator=hno data.pretrain=0.2 data.widening=0.2 data.finish=0.4"
 LATE = "operator=hno data.pretrain=0.4 data.widening=0.2 data.finish=0.2"
-START_BOX = "data.trajectories=160 data.widen=[1.0] data.adaptive.rounds=0"
-MIXED_BOXES = "data.trajectories=160 data.widen=[1.0,2.2] data.adaptive.rounds=0"
-ADAPTIVE = "data.trajectories=96 data.widen=[1.0,2.2] data.adaptive.rounds=2 data.adaptive.labels=256"
+SEVEN = "data.types=null data.validation=16"
+"""Types that labels are solved at, of the drone too."""
+START_BOX = f"{SEVEN} data.trajectories=160 data.widen=[1.0] data.adaptive.rounds=0"
+MIXED_BOXES = f"{SEVEN} data.trajectories=160 data.widen=[1.0,2.2] data.adaptive.rounds=0"
+ADAPTIVE = f"{SEVEN} data.trajectories=96 data.widen=[1.0,2.2] data.adaptive.rounds=2 data.adaptive.labels=256"
 """About as many start states with labels as the two others have: 7 x 96 + 2 x 256 beside 7 x 160."""
-VALUES = f"function=value function.members=1 {START_BOX}"
+EVERYWHERE = f"{ADAPTIVE} data.types=grid5 data.trajectories=27 data.validation=5"
+"""The same number, at 25 types."""
+VALUES = f"function=value {START_BOX}"
 """What every recipe is that does not choose what it learns."""
 SHORT = "activation=tanh trainer.max_steps=1000"
 FIFTEEN = str([[a, b] for a, b in itertools.combinations_with_replacement(range(1, 6), 2)]).replace(" ", "")
@@ -77,8 +81,13 @@ RECIPES: dict[str, dict[str, str]] = {
     "potential": {
         f"{method}, {letter}, {where}": f"operator={method} {function} {labels}"
         for method in ("sno", "hno")
-        for letter, function in (("V", "function=value function.members=1"), ("W", "function=potential"))
-        for where, labels in (("start box", START_BOX), ("mixed boxes", MIXED_BOXES), ("adaptive", ADAPTIVE))
+        for letter, function in (("V", "function=value"), ("W", "function=potential"))
+        for where, labels in (
+            ("start box", START_BOX),
+            ("mixed boxes", MIXED_BOXES),
+            ("adaptive", ADAPTIVE),
+            ("adaptive, 25 types", EVERYWHERE),
+        )
     },
     "default": {
         "sno, sin": "",

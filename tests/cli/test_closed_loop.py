@@ -131,7 +131,7 @@ def test_validation_starts_of_chosen_types(command: Command, monkeypatch: pytest
         ),
         (("validation=grid5", "validation.starts=many"), "validation.starts must be a valid integer; got 'many'"),
         (("validation=grid7",), "Did you mean 'grid5'?"),
-        (("validation.stop=true",), "Known: seed, starts, stop_when_safe, types"),
+        (("validation.stop=true",), "Known: clearance, dt, seed, starts, stop_when_safe, types"),
         (("loss.hardest=0",), "loss.hardest must be greater than 0; got 0"),
         (("loss.hardest=1.5",), "loss.hardest must be less than or equal to 1; got 1.5"),
         (("sampler.rollout=-1",), "sampler.rollout.share must be greater than or equal to 0; got"),
@@ -227,7 +227,7 @@ def test_an_error_that_explodes_is_divergence(command: Command, monkeypatch: pyt
     def training_step(self: TrainingModule, batch: Batch, batch_idx: int) -> Tensor:
         if self.global_step == 3:
             with torch.no_grad():
-                self.operator.network.branch.layers[-1].weight.mul_(1e4)
+                self.operator.networks[0].branch.layers[-1].weight.mul_(1e4)
         return original(self, batch, batch_idx)
 
     monkeypatch.setattr(TrainingModule, "training_step", training_step)

@@ -61,11 +61,11 @@ def test_every_experiment_builds_for_every_game_and_operator(experiment: str, ga
     assert data_of(chosen).streams == needed[operator]
 
 
-@pytest.mark.parametrize(
-    ("overrides", "members"), [((), 3), (("experiment=paper_grid",), 1), (("function.members=5",), 5)]
-)
-def test_the_drone_is_a_median_of_nets_unless_asked_otherwise(overrides: tuple[str, ...], members: int) -> None:
-    assert settings("game=drone", "function=value", *overrides).function["members"] == members
+@pytest.mark.parametrize("experiment", ["paper", "paper_grid"])
+def test_the_papers_comparison_has_as_few_types_for_the_drone_as_for_the_cars(experiment: str) -> None:
+    drone, car = (settings(f"game={game}", f"experiment={experiment}").data for game in ("drone", "narrow_road"))
+    assert drone == car
+    assert settings("game=drone").data.types == "grid5"
 
 
 @pytest.mark.parametrize(

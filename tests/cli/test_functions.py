@@ -43,7 +43,7 @@ def registered(monkeypatch: pytest.MonkeyPatch) -> None:
 )
 def test_auto_is_the_potential_of_a_game_that_has_one(game: str, function: str) -> None:
     chosen = train_settings([f"game={game}"]).function
-    assert chosen == {"name": function, "exact_terminal": True, "members": 3 if game == "drone" else 1}
+    assert chosen == {"name": function, "exact_terminal": True, "members": 1}
     assert train_settings([f"game={game}", "function=auto"]).function == chosen
 
 

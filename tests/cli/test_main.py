@@ -83,7 +83,7 @@ def test_help_shows_groups_that_can_be_chosen_and_keys_with_their_comments(
     ):
         assert part in groups
     keys = yaml.safe_load(printed[printed.index("\n", printed.index("Keys")) :])
-    assert keys["function"]["members"] == 3
+    assert keys["data"]["types"] == "grid5"
     (line,) = [line for line in printed.splitlines() if "precondition_frequency" in line or "pretrain:" in line][:1]
     assert "# share of the steps that are supervised only" in line
 
