@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from hno import games
     from hno.cli.calls import evaluate, train
+    from hno.control.exported import load_exported
     from hno.control.rollout import rollout
     from hno.games.testing import check_game
     from hno.pontryagin.solve import solve
@@ -18,13 +19,25 @@ if TYPE_CHECKING:
     from hno.training.fit import fit
 
 __version__ = "0.1.0"
-__all__ = ["__version__", "check_game", "evaluate", "fit", "games", "load_policy", "rollout", "solve", "train"]
+__all__ = [
+    "__version__",
+    "check_game",
+    "evaluate",
+    "fit",
+    "games",
+    "load_exported",
+    "load_policy",
+    "rollout",
+    "solve",
+    "train",
+]
 
 _PLACES = {
     "check_game": "hno.games.testing:check_game",
     "evaluate": "hno.cli.calls:evaluate",
     "fit": "hno.training.fit:fit",
     "games": "hno.games",
+    "load_exported": "hno.control.exported:load_exported",
     "load_policy": "hno.training.checkpoint:load_policy",
     "rollout": "hno.control.rollout:rollout",
     "solve": "hno.pontryagin.solve:solve",

@@ -18,6 +18,8 @@ from torch import Tensor
 
 Numbers = Tensor | NDArray[Any] | Sequence[Any] | float
 """What people hand over: tensors, arrays, nested lists and numbers."""
+ROUNDING = 1e-5
+"""How far a time to go or a state may lie outside its range, relative to the range."""
 
 
 def tensor_of(name: str, numbers: Numbers) -> Tensor:

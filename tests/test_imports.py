@@ -12,11 +12,12 @@ import hno
 
 ROOT = Path(hno.__file__).parent
 LEVELS = (
-    {"types", "registry", "processes"},
+    {"types", "registry", "processes", "runtime"},
     {"games"},
     {"pontryagin"},
     {"losses", "data"},
     {"operators"},
+    {"export"},
     {"control"},
     {"training", "evaluation"},
     {"report"},

@@ -20,6 +20,7 @@ from hno.cli.media import draw_typical
 from hno.cli.results import Results, write_json
 from hno.cli.sections import chosen_sections, run_sections
 from hno.cli.settings import Episodes, EvaluateSettings
+from hno.control.exported import ExportedPolicy, is_exported, load_exported
 from hno.control.rollout import control_steps
 from hno.data.labels import Request, default_cache, labels_for, safe_labels_for
 from hno.evaluation.closed_loop import CollisionTable, play
@@ -31,11 +32,13 @@ from hno.evaluation.outcome import Played, numbers_of
 from hno.evaluation.sections import Evaluation
 from hno.games import Game
 from hno.games.grid import parse_types, quarter_types
+from hno.runtime import ArtefactError
 from hno.training.checkpoint import LearnedPolicy, find_checkpoint, load_policy
 from hno.types import Extremal
 
 log = logging.getLogger(__name__)
 
+Model = LearnedPolicy | ExportedPolicy
 Types = tuple[float, ...]
 """One type per player."""
 Table = list[dict[str, Any]]
@@ -63,14 +66,29 @@ def check(config: DictConfig) -> EvaluateSettings:
 
 def head(settings: EvaluateSettings) -> dict[str, Any]:
     """What results.json says from the beginning."""
-    first = str(find_checkpoint(settings.checkpoint[0]))
+    first = model_file(settings.checkpoint[0])
     return {"checkpoint": first, "config": settings.model_dump()}
 
 
-def prepared(settings: EvaluateSettings) -> tuple[list[LearnedPolicy], list[Evaluation]]:
+def model_file(path: str) -> str:
+    """The checkpoint that a path stands for, or the folder of an exported controller."""
+    return path if is_exported(path) else str(find_checkpoint(path))
+
+
+def model(path: str, game: str | None) -> Model:
+    """The policy of a checkpoint, or of an exported controller; where a game is named, of that one."""
+    if not is_exported(path):
+        return load_policy(path, game)
+    found = load_exported(path)
+    if game not in (None, found.names()["game"]):
+        raise ArtefactError(f"{path} is a controller of game {found.names()['game']!r}, expected {game!r}.")
+    return found
+
+
+def prepared(settings: EvaluateSettings) -> tuple[list[Model], list[Evaluation]]:
     """The models and their evaluations, before labels are solved. Raises as `check`."""
-    paths = [str(find_checkpoint(path)) for path in settings.checkpoint]
-    policies = [load_policy(path, settings.expected_game) for path in paths]
+    paths = [model_file(path) for path in settings.checkpoint]
+    policies = [model(path, settings.expected_game) for path in paths]
     check_same_game(paths, [policy.game for policy in policies])
     check_evaluation(policies[0].game, settings)
     types = [theta for one in policies for theta in types_to_evaluate(settings.theta, one, settings.unseen)]
@@ -79,7 +97,7 @@ def prepared(settings: EvaluateSettings) -> tuple[list[LearnedPolicy], list[Eval
 
 
 def describe(
-    models: Sequence[tuple[str, LearnedPolicy]],
+    models: Sequence[tuple[str, Model]],
     types: Sequence[Types],
     options: Mapping[str, Any],
     cache: str | None,
@@ -111,7 +129,7 @@ def evaluate(settings: EvaluateSettings, results: Results) -> None:
     use_threads(settings.threads)
     policies, evaluations = prepared(settings)
     models: list[dict[str, Any]] = [
-        {"checkpoint": evaluation.name, **policy.names(), "seed": policy.provenance.seed}
+        {"checkpoint": evaluation.name, **policy.names(), "seed": policy.origin()["seed"]}
         for policy, evaluation in zip(policies, evaluations, strict=True)
     ]
     results.update(**models[0])
@@ -127,7 +145,7 @@ def evaluate(settings: EvaluateSettings, results: Results) -> None:
         results.update(models=models, comparison=PairedComparison().compute(played))
 
 
-def types_to_evaluate(choice: Any, policy: LearnedPolicy, unseen: Any = None) -> list[Types]:
+def types_to_evaluate(choice: Any, policy: Model, unseen: Any = None) -> list[Types]:
     """Player types to evaluate a policy at.
 
     Default are the labelled types and those that `unseen` adds.

@@ -56,6 +56,11 @@ COMMANDS = {
         "Write a page about a run or a sweep, or figures for documents.",
         "report", "folder", ("to",), ("--dry-run", "--to"),
     ),
+    "export": Command(
+        "hno.cli.export:run", "RUN|CHECKPOINT --to numpy|c|onnx|torch [folder=FOLDER]",
+        "Write a controller that runs without this package. It is compared with the checkpoint before it is written.",
+        flags=("--to",),
+    ),
     "list": Command(
         "hno.cli.listing:run", "[KIND ...]",
         "List what is registered: games, methods, networks, activations, losses, sources and optimizers, each with the "

@@ -5,6 +5,7 @@ from __future__ import annotations
 import abc
 import warnings
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from torch import Tensor, nn
@@ -104,14 +105,11 @@ class Feedback(nn.Module, Policy):
             ValueError: shapes do not fit the game or each other, an entry is not finite, or a time to go is not within
                 the horizon.
         """
-        problem = self.operator.problem
-        return self._asked(tau, x, theta, lambda at, field: problem.optimal_control(at.x, field.costate))
+        return self._asked(tau, x, theta, self._controls)
 
     def value(self, tau: Numbers, x: X, theta: Numbers) -> X:
         """V_i of every player, (B, P). Raises as `act`."""
-        return self._asked(
-            tau, x, theta, lambda at, field: field.players if isinstance(field, PotentialField) else field.value
-        )
+        return self._asked(tau, x, theta, lambda at: _values(self.operator.field(at)))
 
     def potential(self, tau: Numbers, x: X, theta: Numbers) -> X:
         """W of an operator of a potential, (B,).
@@ -119,7 +117,7 @@ class Feedback(nn.Module, Policy):
         Raises:
             ValueError: as `act`, or the operator has none.
         """
-        return self._asked(tau, x, theta, lambda at, field: _potential(field).value.squeeze(-1))
+        return self._asked(tau, x, theta, lambda at: _potential(self.operator.field(at)).value.squeeze(-1))
 
     def branch(self, tau: Numbers, x: X, theta: Numbers) -> X:
         """Which branch of a potential is played, int64, (B,); see `hno.data.branches`.
@@ -127,11 +125,11 @@ class Feedback(nn.Module, Policy):
         Raises:
             ValueError: as `act`, or the operator has none.
         """
-        return self._asked(tau, x, theta, lambda at, field: _potential(field).branches.argmax(-1))
+        return self._asked(tau, x, theta, lambda at: _potential(self.operator.field(at)).branches.argmax(-1))
 
     def costate(self, tau: Numbers, x: X, theta: Numbers) -> X:
         """dV_i / dx_j, (B, P, P, n), or dW / dx_j, (B, 1, P, n). Raises as `act`."""
-        return self._asked(tau, x, theta, lambda at, field: field.costate)
+        return self._asked(tau, x, theta, lambda at: self.operator.field(at).costate)
 
     def answer(self, tau: Tensor, x: Tensor, theta: Tensor) -> Answer:
         """Value, costates and controls of one state, (), (P, n), (P,): a pure function without checks.
@@ -143,22 +141,43 @@ class Feedback(nn.Module, Policy):
         control = self.operator.problem.optimal_control(points.x, costate)
         return Answer(value.to(x.dtype), costate.to(x.dtype), control.to(x.dtype))
 
-    def _asked(self, tau: Any, x: Any, theta: Any, answer: Callable[[Points, Field | PotentialField], Tensor]) -> Any:
-        """What is made of the points and the field there, as the question came."""
+    def export(self, to: str, folder: str | Path) -> Path:
+        """Write the controller for use without this package, see `hno.export.export`.
+
+        Args:
+            to: numpy, c, onnx or torch.
+            folder: where; new, empty, or an earlier export.
+        """
+        from hno.export import export
+
+        return export(self.operator, to, folder, self.origin())
+
+    def origin(self) -> dict[str, Any]:
+        """Where the operator comes from, plain containers."""
+        return {}
+
+    def _controls(self, at: Points) -> Tensor:
+        return self.operator.problem.optimal_control(at.x, self.operator.field(at).costate)
+
+    def _asked(self, tau: Any, x: Any, theta: Any, answer: Callable[[Points], Tensor]) -> Any:
+        """What is answered at the points, as the question came."""
         if not self.checked:
-            points = self._cast(tau, x, theta)
-            return in_type_of(x, answer(points, self.operator.field(points)))
+            return in_type_of(x, answer(self._cast(tau, x, theta)))
         asked = question(self.game, tau, x, theta, self.operator.value_scale)
         if not self._warned and bool(outside(self.game, asked.points.x).any()):
             self._warned = True
             message = "x lies outside the PDE box of the game, where nothing was learned: do not trust answers there."
             warnings.warn(f"{message} This policy says so once.", ExtrapolationWarning, stacklevel=3)
-        return asked.answered(answer(asked.points, self.operator.field(asked.points)))
+        return asked.answered(answer(asked.points))
 
     def _cast(self, tau: Tensor, x: Tensor, theta: Tensor) -> Points:
         """The question in the operator's floating-point type."""
         dtype = self.operator.value_scale.dtype
         return Points(tau.to(dtype), x.to(dtype), theta.to(dtype))
+
+
+def _values(field: Field | PotentialField) -> Tensor:
+    return field.players if isinstance(field, PotentialField) else field.value
 
 
 def _potential(field: Field | PotentialField) -> PotentialField:

@@ -10,12 +10,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hno.games import Game
-from hno.types import Numbers, Points, tensor_of
+from hno.types import ROUNDING, Numbers, Points, tensor_of
 
 X = TypeVar("X", Tensor, NDArray[Any])
 """Tensors or arrays: answers are of the kind of the states."""
-ROUNDING = 1e-5
-"""How far a time to go or a state may lie outside its range, relative to the range."""
 
 
 class Question(NamedTuple):

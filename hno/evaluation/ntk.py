@@ -172,11 +172,13 @@ def residuals(operator: ValueOperator, parameters: Parameters, point: Sample) ->
 
 
 def check_rows(operator: ValueOperator, rows: object) -> None:
-    """Refuse an operator of several nets, and fewer rows than one point has.
+    """Refuse an operator of several nets or without weights, and fewer rows than one point has.
 
     Raises:
-        ValueError: either of these.
+        ValueError: one of these.
     """
+    if next(operator.parameters(), None) is None:
+        raise ValueError("ntk=true needs the operator's weights: name its checkpoint, not an exported controller.")
     if operator.potential:
         raise ValueError(
             "ntk=true is for the players' values, which function=value learns; this operator learns a potential."

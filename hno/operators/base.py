@@ -8,6 +8,7 @@ from typing import Any, ClassVar, TypeVar
 
 import torch
 from torch import Tensor, nn
+from torch.func import jacrev
 
 from hno.games import Game
 from hno.games.potential import Problem, Team
@@ -78,6 +79,8 @@ class ValueOperator(nn.Module, abc.ABC):
     """Typical size of values, scalar: what the operator's own outputs are multiplied with."""
     costate_scale: Tensor
     """Typical sizes of costates, (P, P, n), or (1, P, n) of a potential."""
+    jacobian: Callable[..., Any] = staticmethod(jacrev)
+    """How `value_and_costate` differentiates; `jacfwd` gives the same by what does not depend on the types, first."""
 
     def __init__(self, game: Game) -> None:
         super().__init__()

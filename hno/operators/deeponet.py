@@ -99,15 +99,15 @@ class DeepONet(Network):
     def values(self, y: Tensor, sensors: Tensor, which: Tensor) -> Tensor:
         """Values at each row for several branch inputs: the trunk runs once.
 
-        Where there are few of them, one product gives the values for all, and each row takes its own: the derivative of
-        that costs less than that of a look-up of coefficients.
+        Where several rows share them and there are few, one product gives the values for all, and each row takes its
+        own: the derivative of that costs less than that of a look-up of coefficients.
         """
         hidden, last = self.trunk.folded()
         h, branch = self._pooled(y), self.branch(sensors)
         for weight, bias in hidden:
             h = self.trunk.activation.core(torch.addmm(bias, h, weight.mT))
         coefficient, shift = branch @ last.weight, branch @ last.bias
-        if len(branch) > TABLE:
+        if len(branch) > min(TABLE, which.numel() - 1):
             return torch.linalg.vecdot(h.unsqueeze(-2), coefficient[which]) + shift[which]
         return (h @ coefficient.mT + shift).gather(-1, which)
 

@@ -8,7 +8,6 @@ from typing import final
 
 import torch
 from torch import Tensor
-from torch.func import jacrev
 
 from hno.games import Game
 from hno.operators.base import FieldFunction, ValueOperator, at_fixed_points, functions
@@ -66,7 +65,7 @@ class GradientOperator(ValueOperator):
             found = self.member_values(tau.unsqueeze(0), x.unsqueeze(0), theta.unsqueeze(0)).squeeze(1)
             return found, found
 
-        costate, value = jacrev(values, has_aux=True)(x)
+        costate, value = self.jacobian(values, has_aux=True)(x)
         return value.median(0).values, costate.median(0).values
 
     def field(self, points: Points, types: Types | None = None) -> Field:

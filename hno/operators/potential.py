@@ -9,7 +9,6 @@ from typing import final
 
 import torch
 from torch import Tensor
-from torch.func import jacrev
 
 from hno.games import Game
 from hno.operators.base import FieldFunction, ValueOperator, at_fixed_points, functions
@@ -88,7 +87,7 @@ class PotentialOperator(ValueOperator):
             branches, players = self._functions(*at, self._heads(*at))
             return branches.squeeze(1), (branches.squeeze(1), players.squeeze(1))
 
-        slopes, (branches, players) = jacrev(functions, has_aux=True)(x)
+        slopes, (branches, players) = self.jacobian(functions, has_aux=True)(x)
         best = branches.median(0).values.argmax(-1)
         return _chosen(players.median(0).values, best), _chosen(slopes.median(0).values, best).unsqueeze(0)
 

@@ -366,6 +366,10 @@ class LearnedPolicy(Feedback):
         chosen = {"function": parts.function.name, "activation": parts.activation.name}
         return {"game": game, "operator": self.provenance.method, **chosen}
 
+    def origin(self) -> dict[str, Any]:
+        """Names of its parts, training types and seed."""
+        return {"names": self.names(), "types": [list(theta) for theta in self.types], "seed": self.provenance.seed}
+
 
 def load_policy(path: str | Path, game: str | None = None, threads: int = 1) -> LearnedPolicy:
     """The policy of the operator in a checkpoint. Arguments and errors as of `load_operator` and `LearnedPolicy`."""
