@@ -39,8 +39,8 @@ def _model(inputs: Mapping[str, Node], outputs: Mapping[str, Node], about: Mappi
         graph.add(node)
     for name, node in outputs.items():
         graph.call("Identity", [graph.names[node]], name)
-    ends = [[_info(name, node) for name, node in side.items()] for side in (inputs, outputs)]
-    made = onnx.helper.make_graph(graph.nodes, "controller", *ends, graph.constants)
+    given, found = ([_info(name, node) for name, node in side.items()] for side in (inputs, outputs))
+    made = onnx.helper.make_graph(graph.nodes, "controller", given, found, graph.constants)
     model = onnx.helper.make_model(
         made, opset_imports=[onnx.helper.make_opsetid("", OPSET)], ir_version=IR, producer_name="hno"
     )
