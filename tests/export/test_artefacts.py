@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
+import os
+import py_compile
 import random
 import shutil
 import subprocess
@@ -34,7 +37,8 @@ SMALL = Architecture(Choice("potential"), Choice("deeponet", {"width": 8, "depth
 
 @pytest.fixture
 def copied(exported, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(exported(CASE, "numpy"), tmp_path / "copied"))
+    skipped = shutil.ignore_patterns("__pycache__")
+    return Path(shutil.copytree(exported(CASE, "numpy"), tmp_path / "copied", ignore=skipped))
 
 
 @pytest.mark.parametrize("kind", ["numpy", "c"])
@@ -45,6 +49,29 @@ def test_rollouts_of_the_exported_controller_are_those_of_the_policy(exported, k
     played, again = (rollout(game, player, starts, [1.5, 4.0], dt=0.1) for player in (policy, own))
     torch.testing.assert_close(again.x, played.x, atol=2e-3, rtol=1e-4)
     torch.testing.assert_close(own.value(1.0, starts, [1.0, 1.0]), policy.value(1.0, starts, [1.0, 1.0]))
+
+
+def test_what_was_verified_is_what_runs(copied: Path) -> None:
+    """Python would rather run a compiled file beside the source, if that says the source's size and time."""
+    source, forged = copied / "controller.py", copied / "forged.py"
+    stamp = source.stat()
+    forged.write_text("raise AssertionError('this was never verified')".ljust(stamp.st_size))
+    os.utime(forged, ns=(stamp.st_atime_ns, stamp.st_mtime_ns))
+    py_compile.compile(str(forged), importlib.util.cache_from_source(str(source)))
+    forged.unlink()
+    before = sorted(copied.rglob("*"))
+    with pytest.raises(AssertionError, match="never verified"):
+        imported_as_usual(source)
+    assert load(copied)
+    assert sorted(copied.rglob("*")) == before
+
+
+def imported_as_usual(source: Path) -> None:
+    """The usual way to import a file."""
+    spec = importlib.util.spec_from_file_location("usual", source)
+    assert spec is not None
+    assert spec.loader is not None
+    spec.loader.exec_module(importlib.util.module_from_spec(spec))
 
 
 def test_every_flipped_byte_is_found(copied: Path) -> None:
