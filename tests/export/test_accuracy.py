@@ -31,10 +31,10 @@ MORE = (
 
 
 def cases() -> Iterator[object]:
-    """The first in every language, the second in the lightest; the others take minutes."""
+    """The first in every language, the second in one; the others take minutes."""
     for case in (*CASES, *MORE):
         for kind in ("numpy", "c", "onnx", "torch"):
-            fast = case == CASES[0] or (case == CASES[1] and kind in ("numpy", "onnx"))
+            fast = case == CASES[0] or (case == CASES[1] and kind == "onnx")
             yield pytest.param(case, kind, marks=() if fast else pytest.mark.slow)
 
 

@@ -50,8 +50,11 @@ def killed(folder: Path, moment: Moment, *words: str) -> Path:
 
 @pytest.mark.parametrize(
     "moment",
-    [Moment(2), Moment(2 * EVERY, "on_validation_start"), Moment(STEPS, "on_validation_end")],
-    ids=["before its first checkpoint", "in a validation", "before its last checkpoint"],
+    [
+        pytest.param(Moment(2), id="before its first checkpoint", marks=pytest.mark.slow),
+        pytest.param(Moment(2 * EVERY, "on_validation_start"), id="in a validation"),
+        pytest.param(Moment(STEPS, "on_validation_end"), id="before its last checkpoint", marks=pytest.mark.slow),
+    ],
 )
 def test_a_killed_run_ends_like_an_uninterrupted_one(whole: Path, tmp_path: Path, moment: Moment) -> None:
     folder = killed(tmp_path / "a run (killed)", moment)
@@ -67,7 +70,7 @@ def test_a_killed_run_ends_like_an_uninterrupted_one(whole: Path, tmp_path: Path
     assert (folder / ".hydra" / "config.yaml").read_bytes() == before
 
 
-@pytest.mark.parametrize("hook", ["on_train_batch_start", "on_validation_start"])
+@pytest.mark.parametrize("hook", ["on_train_batch_start", pytest.param("on_validation_start", marks=pytest.mark.slow)])
 def test_a_run_that_a_signal_ended_ends_like_an_uninterrupted_one(whole: Path, tmp_path: Path, hook: str) -> None:
     step = 2 * EVERY if "validation" in hook else 49  # the next one has a row
     folder, moment = tmp_path / "run", Moment(step, hook, signal=signal.SIGUSR1)

@@ -151,7 +151,7 @@ def labels(cache: Path) -> tuple[str, ...]:
     return ("labels", "game=narrow_road", "theta=1,1", "n=2000", "workers=2", f"cache={cache}")
 
 
-@pytest.mark.parametrize(("name", "code"), [("SIGINT", 130), ("SIGKILL", -9)])
+@pytest.mark.parametrize(("name", "code"), [pytest.param("SIGINT", 130, marks=pytest.mark.slow), ("SIGKILL", -9)])
 def test_no_label_worker_outlives_its_parent(tmp_path: Path, name: str, code: int) -> None:
     cache = tmp_path / "cache"
     with started("labels", tmp_path, cache, *labels(cache)) as command:
