@@ -52,6 +52,8 @@ class _NumPy(Artefact):
         import importlib.util
 
         class Verified(importlib.machinery.SourceFileLoader):
+            """Of sources alone."""
+
             def get_code(self, fullname: str) -> CodeType:
                 """Of the file that was verified, not of a `__pycache__` beside it; and none is left."""
                 return self.source_to_code(self.get_data(self.path), self.path)
