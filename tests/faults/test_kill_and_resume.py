@@ -226,7 +226,9 @@ def test_an_offline_wandb_run_goes_on_under_its_id(whole: Path, tmp_path: Path) 
     assert len(files) == 2
     assert len({file.stem for file in files}) == 1
     rows = [row for file in files for row in history_of(file) if "loss/total" in row]
-    assert [row["trainer/global_step"] for row in rows] == [49, 99]
-    kept = [row for row in curve(whole) if row["loss/total"]]
-    assert [row["loss/total"] for row in rows] == pytest.approx([float(row["loss/total"]) for row in kept], rel=1e-12)
+    steps = [row["trainer/global_step"] for row in rows]  # a kill loses what W&B has not written yet; the csv has it
+    assert steps == sorted(set(steps))
+    assert 99 in steps
+    kept = {int(row["step"]): float(row["loss/total"]) for row in curve(whole) if row["loss/total"]}
+    assert [row["loss/total"] for row in rows] == pytest.approx([kept[step] for step in steps], rel=1e-12)
     assert json.loads((folder / "results.json").read_text())["status"] == "finished"
