@@ -1,8 +1,9 @@
 """How long an exported controller takes: `python benchmarks/latency.py [RUN|CHECKPOINT] [CALLS]`.
 
 One thread, one state that moves a little, types that stay as they are, so what they determine is prepared: median, p99
-and p99.9 of each call in microseconds, beside a loop that calls nothing. Then states per second in batches. Without a
-checkpoint it is the default operator of narrow_road with random weights, which takes as long. The last line is JSON.
+and p99.9 of each call in microseconds, beside a loop that calls nothing. Then states per second in batches, and what
+`import hno.runtime` adds to NumPy's own import. Without a checkpoint it is the default operator of narrow_road with
+random weights, which takes as long. The last line is JSON; its torch is the exported program.
 """
 
 from __future__ import annotations
@@ -78,6 +79,7 @@ def main(path: str | None, calls: int) -> None:
         for kind, folder in folders.items():
             _throughput(kind, load(folder).answers, policy)
         _throughput("PyTorch policy", policy.act, policy)
+    print(f"\nimport hno.runtime, after numpy: {min(_import_ms() for _ in range(5)):.1f} ms")
     if torch.cuda.is_available():
         _on_gpu(policy)
     names = {"c_p99_us": "C, prepared", "numpy_p99_us": "NumPy, prepared", "onnx_p99_us": "ONNX, prepared",
@@ -183,6 +185,11 @@ def _throughput(name: str, answer: Callable[..., object], policy: Feedback) -> N
         spent = min(_timed(lambda given=given: answer(*given), 10))  # type: ignore[misc]  # mypy infers no lambda's type
         rates.append(1e6 * size / spent)
     print(f"{name:<44}" + "".join(f"{rate:>9.0f}" for rate in rates), flush=True)
+
+
+def _import_ms() -> float:
+    program = "import numpy, time; t = time.perf_counter(); import hno.runtime; print(1e3 * (time.perf_counter() - t))"
+    return float(subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout)
 
 
 def _on_gpu(policy: Feedback) -> None:

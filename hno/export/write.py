@@ -29,6 +29,8 @@ from hno.types import ROUNDING
 
 TOLERANCE = 1e-5
 """Largest error that an artefact may have, relative to the largest entry of the output."""
+SILENT = 0.1
+"""Largest share of the questions that may say nothing."""
 POINTS = 1000
 """Random questions by which every artefact is checked."""
 NUDGE, JUMP, TIE = 1e-4, 1e-4, 2e-6
@@ -110,10 +112,11 @@ def export(operator: ValueOperator, to: str, folder: str | Path, origin: Mapping
         draft.mkdir()
         _fill(draft, files, about)
         checked = check(load(draft), double)
-        if checked.error > TOLERANCE or checked.left_out > 0.5:
+        if checked.error > TOLERANCE or checked.left_out > SILENT:
             raise ExportError(
                 f"The controller for {to} is not written: it differs from the operator by {checked.error:.1e} of the "
-                f"largest entry ({TOLERANCE:g} are allowed), and {checked.left_out:.1%} of the questions say nothing."
+                f"largest entry ({TOLERANCE:g} are allowed), and {checked.left_out:.1%} of the questions say nothing "
+                f"({SILENT:.0%} are allowed)."
             )
         _fill(draft, files, about | {"errors": checked.errors, "left_out": checked.left_out})
         if place.exists():

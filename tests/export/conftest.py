@@ -26,7 +26,11 @@ def operator_of(case: str) -> ValueOperator:
     parts = Choice(function, options), Choice("deeponet", {"width": 12, "depth": 3}), Choice(activation)
     torch.manual_seed(0)
     operator = make_operator(OWN[game]() if game in OWN else make(game), Architecture(*parts))
-    operator.value_scale.fill_(40.0)  # as after training: branches of a potential are apart
+    operator.value_scale.fill_(40.0)
+    if operator.potential:  # branches are apart, as after training: the sides stand before the kind of function
+        players, pairs = operator.game.players, operator.sides.shape[-1]
+        for network in operator.networks:
+            network.branch.layers[0].weight.data[:, -(1 + players) - pairs : -(1 + players)] *= 10
     return operator.eval().requires_grad_(False)
 
 
