@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import hashlib
 import math
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import Any, NamedTuple
 
 import lightning as L
@@ -103,6 +103,8 @@ class GameData(L.LightningDataModule):
         self.val_rows: Sample | None = None
         self.visits: list[Visit] = []
         """The latest two validations."""
+        self.between: Callable[[], None] = stop_if_asked
+        """Called between two steps, where nothing is half done."""
 
     def _check(self) -> None:
         if self.collocation.types not in ("labelled", "box"):
@@ -273,7 +275,7 @@ class _Steps(IterableDataset[Batch]):
     def __iter__(self) -> Iterator[Batch]:
         step = self.first
         while True:
-            stop_if_asked()  # the step before is complete, its losses are logged
+            self.data.between()
             yield self.data.batch(step)
             step += 1
 

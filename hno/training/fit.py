@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -157,8 +158,10 @@ def fit(
     plan = data.labels
     adding = AdaptiveLabels(settings.adaptive, settings.planned, data.seed, settings.dt, plan.solver, plan.workers)
     logbook = Logbook()
-    own = [adding, watch, Polish(settings.polish, watch), logbook]
+    guard = SaveOnSignal(folder, lambda step: step in adding.due or watch.due(step, settings.steps))
+    own = [guard, adding, watch, Polish(settings.polish, watch), logbook]
     trainer = make_trainer(settings, folder, loggers, [*own, *callbacks])
+    data.between = partial(guard.between, trainer)
     remove_drafts(folder)
     if resume is not None:
         check_training_state(resume, read_content(resume), settings.steps)
@@ -211,7 +214,7 @@ def make_trainer(
         num_sanity_val_steps=0,
         log_every_n_steps=max(1, min(50, settings.planned)),
         logger=list(loggers) or False,
-        callbacks=[StopOnDivergence(folder, files), SaveOnSignal(folder), *callbacks, keeping_last],
+        callbacks=[StopOnDivergence(folder, files), *callbacks, keeping_last],
         plugins=[files],
         enable_progress_bar=any(isinstance(callback, ProgressBar) for callback in callbacks),
         enable_model_summary=False,

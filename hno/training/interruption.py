@@ -2,29 +2,44 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import lightning as L
 
-from hno.processes import Interrupted, take_back_signals
+from hno.processes import Interrupted, stop_if_asked, take_back_signals
 from hno.training.saving import LAST
 
 
 class SaveOnSignal(L.Callback):
-    """Leave a checkpoint where a signal ends the training between two steps.
+    """Leave a checkpoint where a signal ends the training between two steps, and before a step with long work after it.
+
+    What a signal breaks off after that step, when it does not end in time, lacks the step alone.
 
     Args:
         folder: of the run.
+        long: whether long work follows a step, by its number.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self.path = folder / LAST
+    def __init__(self, folder: Path, long: Callable[[int], bool]) -> None:
+        self.path, self.long, self.saved = folder / LAST, long, 0
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Take signals back from Lightning, which ends trainings without a checkpoint."""
+        self.saved = trainer.global_step
         take_back_signals()
+
+    def between(self, trainer: L.Trainer) -> None:
+        """Save what would take long to come to again; the step before is complete, its losses are logged."""
+        stop_if_asked()
+        if trainer.global_step > self.saved and self.long(trainer.global_step + 1):
+            self._save(trainer)
 
     def on_exception(self, trainer: L.Trainer, pl_module: L.LightningModule, exception: BaseException) -> None:
         """Save, unless a step is half done."""
         if isinstance(exception, Interrupted) and exception.between and trainer.global_step > 0:
-            trainer.save_checkpoint(self.path, weights_only=False)
+            self._save(trainer)
+
+    def _save(self, trainer: L.Trainer) -> None:
+        self.saved = trainer.global_step
+        trainer.save_checkpoint(self.path, weights_only=False)

@@ -103,6 +103,10 @@ class ClosedLoopValidation(L.Callback):
         """Whether the training is to end because no start collided."""
         return self.stop and self.best is not None and self.best.collision_rate == 0
 
+    def due(self, step: int, last: int) -> bool:
+        """Whether a step is one after which there is a validation."""
+        return step % self.every == 0 or step == last
+
     def begin(self, labels: Sequence[Extremal], later: Later | None = None) -> None:
         """Play from the starts of these labels, which are safe, one set per type; without any, play nothing.
 
@@ -123,7 +127,7 @@ class ClosedLoopValidation(L.Callback):
     ) -> None:
         """Validate where it is time to."""
         assert isinstance(pl_module, TrainingModule)
-        due = trainer.global_step % self.every == 0 or trainer.global_step == trainer.max_steps
+        due = self.due(trainer.global_step, trainer.max_steps)
         self.found = self.consider(trainer, pl_module) if due else None
         trainer.should_stop |= self.satisfied
 

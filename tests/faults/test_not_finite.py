@@ -51,7 +51,7 @@ def test_what_is_not_finite_ends_the_training_and_is_never_saved(
     *_, good = str(error.value).removesuffix(".").split()
     contents = {path: read_content(path) for path in tmp_path.glob("*.ckpt")}
     assert Path(good) in contents
-    assert contents[Path(good)]["global_step"] in (EVERY, 2 * EVERY)
+    assert contents[Path(good)]["global_step"] in (EVERY, 2 * EVERY - 1, 2 * EVERY)
     for content in contents.values():
         assert all(bool(weights.isfinite().all()) for weights in content["state_dict"].values())
         assert content["global_step"] <= 2 * EVERY
@@ -74,4 +74,10 @@ def test_an_absurd_rate_leaves_finite_checkpoints(tmp_path: Path, name: str, rat
 def test_a_training_keeps_its_last_two_checkpoints(tmp_path: Path) -> None:
     run(tmp_path, steps=3 * EVERY - 1)
     steps = [read_content(tmp_path / name)["global_step"] for name in (LAST, PREVIOUS)]
-    assert steps == [3 * EVERY - 1, 2 * EVERY]
+    assert steps == [3 * EVERY - 1, 3 * EVERY - 2]
+
+
+def test_a_step_with_a_validation_after_it_can_be_repeated(tmp_path: Path) -> None:
+    run(tmp_path, steps=2 * EVERY)
+    steps = [read_content(tmp_path / name)["global_step"] for name in (LAST, PREVIOUS)]
+    assert steps == [2 * EVERY, 2 * EVERY - 1]
