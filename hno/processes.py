@@ -51,6 +51,8 @@ class _State:
     """Whether signals are this module's."""
     waits = False
     """Whether it waits for `stop_if_asked`."""
+    follows = False
+    """Whether it ends with its parent."""
     tell: Callable[[int], bool] | None = None
     """Passes a signal on to other processes; whether any of them is to end first."""
 
@@ -103,6 +105,18 @@ def interruptible() -> Iterator[None]:
             signal.signal(number, signal.SIG_DFL if handler is None else handler)
 
 
+@contextmanager
+def interruptible_call() -> Iterator[None]:
+    """As `interruptible`, in a program of somebody else: it ends in KeyboardInterrupt, or in SystemExit by others."""
+    try:
+        with interruptible():
+            yield
+    except Interrupted as stop:
+        if _State.taken:
+            raise
+        raise KeyboardInterrupt if stop.number == signal.SIGINT else SystemExit(stop.code) from stop
+
+
 def take_back_signals() -> None:
     """Take signals from a library that put itself before this module, inside `interruptible`."""
     if _State.taken:
@@ -149,10 +163,24 @@ def serve(parent: int) -> None:
     for number in SIGNALS:
         if number != signal.SIGTERM:
             signal.signal(number, signal.SIG_IGN)
+    _watch(parent, lambda: os._exit(1))
 
+
+def follow(parent: int) -> None:
+    """End this process as SIGTERM does, in good order, when the process that started it is gone; said once is enough.
+
+    Args:
+        parent: the id of the process that work is done for; nothing happens where another one started this.
+    """
+    if os.getppid() == parent and not _State.follows:
+        _State.follows = True
+        _watch(parent, lambda: os.kill(os.getpid(), signal.SIGTERM))
+
+
+def _watch(parent: int, orphaned: Callable[[], None]) -> None:
     def watch() -> None:
         while os.getppid() == parent:
             time.sleep(0.5)
-        os._exit(1)
+        orphaned()
 
     threading.Thread(target=watch, daemon=True).start()

@@ -16,9 +16,11 @@ from hno.cli.results import Results, recorded
 from hno.cli.settings import TrainSettings
 from hno.cli.train import head, train_operator
 from hno.games import Game, games
+from hno.processes import interruptible_call
 from hno.training.checkpoint import LearnedPolicy, load_policy
 
 
+@interruptible_call()
 def train(
     game: str | Game,
     method: str = "sno",
@@ -39,6 +41,7 @@ def train(
     Raises:
         ValueError, LookupError: settings that are unknown or make no sense; or the folder is another run's.
         DivergedError: the loss, or the error on held-out labels, is no longer sound.
+        KeyboardInterrupt, SystemExit: a signal ended it; the folder has a checkpoint to go on from.
     """
     name = game if isinstance(game, str) else games.name_of(type(game))
     constants = {} if isinstance(game, str) else {f"game.constants.{k}": v for k, v in game.constants.items()}
@@ -52,6 +55,7 @@ def train(
     return load_policy(fitted.checkpoint)
 
 
+@interruptible_call()
 def evaluate(
     checkpoint: str | Path, folder: str | Path | None = None, settings: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
@@ -68,6 +72,7 @@ def evaluate(
     Raises:
         ValueError, LookupError: settings that are unknown or make no sense.
         CheckpointError: a checkpoint that cannot be read.
+        KeyboardInterrupt, SystemExit: a signal ended it.
     """
     chosen = _overrides("evaluate", {"checkpoint": str(checkpoint), **(settings or {})})
     checked = evaluation.check(compose("evaluate", for_hydra("evaluate", Arguments([], chosen, {}))))

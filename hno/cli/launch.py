@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import sys
 import tempfile
 import traceback
@@ -26,7 +27,7 @@ from hno.cli.schema import REGISTRIES
 from hno.cli.sections import show
 from hno.cli.sweep import Entry, Job, Ledger, show_jobs
 from hno.evaluation.format import NAMES, counted
-from hno.processes import Interrupted, interruptible, passed_on
+from hno.processes import Interrupted, follow, interruptible, passed_on
 from hno.registry import UnknownNameError
 
 log = logging.getLogger(__name__)
@@ -127,11 +128,12 @@ def _here(words: Sequence[str]) -> list[str]:
 
 
 def _swept(task: Task, words: Sequence[str], folder: Path, dry: bool) -> int:
-    own = {kind: registry().own() for kind, registry in REGISTRIES.items()}
+    own, this = {kind: registry().own() for kind, registry in REGISTRIES.items()}, os.getpid()
     failure = None
     with Ledger.within(folder) as ledger:
 
         def job(config: DictConfig) -> None:  # a launcher may send it to another process
+            follow(this)
             _job(task, config, ledger, own, dry)
 
         try:

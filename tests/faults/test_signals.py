@@ -15,10 +15,11 @@ import lightning as L
 import pytest
 import torch
 
+import hno
 from hno import processes
 from hno.cli import evaluate
 from hno.cli.logs import StepLines
-from hno.processes import Interrupted, interruptible, stop_if_asked, waiting_signals
+from hno.processes import Interrupted, interruptible, interruptible_call, stop_if_asked, waiting_signals
 from hno.training.saving import LAST, read_content
 from tests.cli import conftest
 from tests.cli.conftest import SMOKE, Command, Outcome
@@ -125,6 +126,25 @@ def test_a_signal_ends_a_training_between_two_steps_and_it_goes_on_from_there(
     assert again.results["table"] == whole.results["table"]
 
 
+@pytest.mark.usefixtures("signal_at_step_7", "clean_globals")
+def test_a_signal_ends_a_training_that_a_program_calls(tmp_path: Path, cache: Path) -> None:
+    settings = {"experiment": "smoke", "data.types": [[1, 1]], "data.workers": 1, "evaluation.dt": 0.1}
+    with pytest.raises(SystemExit) as stop:
+        hno.train("narrow_road", "hno", tmp_path, settings)
+    assert stop.value.code == 143
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    assert read_content(tmp_path / LAST)["global_step"] == 7
+    assert json.loads((tmp_path / "results.json").read_text())["reason"] == "SIGTERM"
+
+
+@pytest.mark.parametrize(("name", "end"), [("SIGINT", KeyboardInterrupt), ("SIGHUP", SystemExit)])
+def test_a_signal_ends_a_call_as_programs_know_it(name: str, end: type[BaseException]) -> None:
+    with pytest.raises(end), interruptible_call():
+        send(name)
+    with pytest.raises(Interrupted), interruptible(), interruptible_call():
+        send(name)
+
+
 def test_a_signal_ends_an_evaluation(
     command: Command,
     random_checkpoint: Path,
@@ -209,6 +229,25 @@ def test_every_signal_in_every_work(tmp_path: Path, cache: Path, random_checkpoi
 @pytest.mark.parametrize("launcher", LAUNCHERS)
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGINT"])
 def test_a_signal_ends_every_sweep(tmp_path: Path, cache: Path, launcher: str, name: str) -> None:
+    left, found = after_in_a_sweep(name, launcher, tmp_path, cache)
+    many = 1 if launcher == "basic" else 2
+    assert (left.code, left.processes) == (SIGNALS[name], []), left.text
+    assert found == [("interrupted", name)] * many
+    assert left.text.count(f"interrupted: {name}") == many
+    assert "Traceback" not in left.text
+    print(f"{launcher}, {name}: {many} jobs ended after {left.seconds:.1f} s with {left.code}")
+
+
+@pytest.mark.slow
+def test_no_job_outlives_a_sweep_that_is_killed(tmp_path: Path, cache: Path) -> None:
+    left, found = after_in_a_sweep("SIGKILL", "joblib", tmp_path, cache)
+    assert (left.code, left.processes) == (-9, []), left.text
+    assert found == [("interrupted", "SIGTERM")] * 2
+    assert len([*(tmp_path / "run").rglob(LAST)]) == 2
+
+
+def after_in_a_sweep(name: str, launcher: str, tmp_path: Path, cache: Path) -> tuple[Left, list[tuple[str, str]]]:
+    """What is left of a sweep after a signal while its jobs train, and what became of them."""
     if launcher != "basic":
         pytest.importorskip(f"hydra_plugins.hydra_{launcher}_launcher")
     steps = ("trainer.max_steps=100000", "trainer.compile=false", "trainer.validate_every=100000")
@@ -217,9 +256,5 @@ def test_a_signal_ends_every_sweep(tmp_path: Path, cache: Path, launcher: str, n
     with started("sweep", tmp_path, cache, *words, "-m") as command:
         command.until(lambda: sum("step 5 of" in log.read_text() for log in runs.rglob("train.log")) == many)
         left = command.end(getattr(signal, name))
-    assert (left.code, left.processes) == (SIGNALS[name], []), left.text
     found = [json.loads(path.read_text()) for path in runs.rglob("results.json")]
-    assert [(results["status"], results["reason"]) for results in found] == [("interrupted", name)] * many
-    assert left.text.count(f"interrupted: {name}") == many
-    assert "Traceback" not in left.text
-    print(f"{launcher}, {name}: {many} jobs ended after {left.seconds:.1f} s with {left.code}")
+    return left, [(results["status"], results["reason"]) for results in found]
