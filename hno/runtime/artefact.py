@@ -17,6 +17,12 @@ if TYPE_CHECKING:
 MANIFEST = "manifest.json"
 FORMAT = 1
 """Version of the manifest."""
+ENTRIES = {
+    "kind": str, "game": str, "fingerprint": str, "constants": dict, "origin": dict, "outputs": dict, "files": dict,
+    "players": int, "states": int, "controls": int, "potential": bool, "horizon": float, "rounding": float,
+    "state_box": list, "type_box": list, "control_box": list,
+}  # fmt: skip
+"""What a manifest says, and of which type."""
 
 
 class ArtefactError(RuntimeError):
@@ -54,7 +60,11 @@ def read_manifest(folder: str | Path) -> dict[str, Any]:
         raise ArtefactError(
             f"{place} has format {content.get('format')!r:.20}, this version reads format {FORMAT}: export it again."
         )
+    if wrong := [name for name, kind in ENTRIES.items() if type(content.get(name)) is not kind]:
+        raise ArtefactError(f"{place / MANIFEST} was not written by hno: it has no sound {', '.join(wrong)}.")
     for name, digest in content["files"].items():
+        if Path(name).name != name:
+            raise ArtefactError(f"{place / MANIFEST} was not written by hno: {name!r:.80} is no name of a file.")
         _check(place / name, digest)
     return content
 

@@ -28,6 +28,7 @@ from hno.export.numpy_source import FORMS
 from hno.games import make
 from hno.operators import Architecture, Choice, ValueOperator, make_operator
 from hno.runtime import ArtefactError, load, signed
+from hno.runtime.artefact import ENTRIES
 from hno.training.checkpoint import Provenance, record
 from hno.training.saving import seal
 from tests.conftest import TEST
@@ -107,6 +108,19 @@ def test_other_versions_kinds_and_games_are_refused(copied: Path) -> None:
         hno.load_exported(changed(game="lane_change"))
     with pytest.raises(ArtefactError, match="no exported controller"):
         hno.load_exported(copied / "nowhere")
+
+
+def test_a_manifest_that_hno_did_not_write_is_refused(copied: Path) -> None:
+    about = json.loads((copied / "manifest.json").read_text())
+    for name in ENTRIES:
+        for junk in ({}, {name: None}, {name: {} if ENTRIES[name] is list else []}):
+            forged = {key: entry for key, entry in about.items() if key != name} | junk
+            (copied / "manifest.json").write_text(signed(forged))
+            with pytest.raises(ArtefactError, match=name):
+                load(copied)
+    (copied / "manifest.json").write_text(signed(about | {"files": {"../elsewhere": "0"}}))
+    with pytest.raises(ArtefactError, match="no name of a file"):
+        load(copied)
 
 
 def test_a_missing_compiler_is_named(exported, monkeypatch: pytest.MonkeyPatch) -> None:
