@@ -52,7 +52,8 @@ def killed(folder: Path, moment: Moment, *words: str) -> Path:
     "moment",
     [
         pytest.param(Moment(2), id="before its first checkpoint", marks=pytest.mark.slow),
-        pytest.param(Moment(2 * EVERY, "on_validation_start"), id="in a validation"),
+        pytest.param(Moment(2 * EVERY - 5), id="after a row that no checkpoint has"),
+        pytest.param(Moment(2 * EVERY, "on_validation_start"), id="in a validation", marks=pytest.mark.slow),
         pytest.param(Moment(STEPS, "on_validation_end"), id="before its last checkpoint", marks=pytest.mark.slow),
     ],
 )
@@ -64,7 +65,8 @@ def test_a_killed_run_ends_like_an_uninterrupted_one(whole: Path, tmp_path: Path
     assert train(f"resume={folder}") == 0
     check_equal(folder, whole)
     (told,) = results(folder)["resumed"]
-    step = moment.step - 1 if "validation" in moment.hook else 0  # saved before a step that is validated
+    precedes = "validation" in moment.hook  # a checkpoint the step that is validated
+    step = moment.step - 1 if precedes else moment.step // EVERY * EVERY
     assert (told["step"], told["changes"]) == (step, {})
     assert told["checkpoint"] == (str(folder / LAST) if step else None)
     assert (folder / ".hydra" / "config.yaml").read_bytes() == before
