@@ -140,7 +140,13 @@ class Many:
         self._artefact, self._theta = artefact, theta
 
     def replace(self, row: int, theta: NDArray[Any]) -> None:
-        """Other types (P,) in the place of some."""
+        """Other types (P,) in the place of some.
+
+        Raises:
+            ValueError: an entry is not finite.
+        """
+        if not np.isfinite(theta).all():
+            raise ValueError(f"types must be finite; got {theta}.")
         self._theta[row] = theta
 
     def __call__(self, tau: float, x: ArrayLike) -> NDArray[np.float32]:

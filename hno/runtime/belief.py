@@ -111,32 +111,38 @@ class Believer:
         learning: Learning = Learning(),
         prior: ArrayLike | None = None,
     ) -> None:
+        about, candidates = artefact.about, np.array(types, np.float32)
         if acts not in ("mean", "mode"):
-            raise ValueError(f'acts must be "mean" or "mode"; got {acts!r}. Others need the costates\' best response.')
-        if not 0 <= player < artefact.about["players"]:
-            raise ValueError(f"player must be from 0 to {artefact.about['players'] - 1}; got {player}.")
-        candidates = np.asarray(types, np.float32)
+            raise ValueError(f"acts must be one of mean, mode with an exported controller; got {acts!r}.")
+        if not 0 <= player < about["players"]:
+            raise ValueError(f"player must be from 0 to {about['players'] - 1}; got {player}.")
         if candidates.ndim == 2 and np.unique(candidates[:, player]).size != 1:
             raise ValueError(f"Column {player} of types holds the player's own type, the same in every row.")
-        count = len(candidates)
-        learning.check(count)
-        self.belief = distribution(prior, (count,))
-        self.types, self._player, self._learning, self._acts = candidates, player, learning, acts
-        self._many = artefact.many(np.concatenate([candidates, candidates[:1]]) if acts == "mean" else candidates)
-        about = artefact.about
+        rows = np.concatenate([candidates, candidates[:1]]) if acts == "mean" else candidates
+        self._many = artefact.many(rows)
+        learning.check(len(candidates))
+        self.belief = distribution(prior, (len(candidates),))
+        self.types, self._player, self._learning, self._mean = candidates, player, learning, acts == "mean"
+        self._predicted: Reals | None = None
         low, high = np.array(about["control_box"])
         self._others = np.delete(np.arange(about["players"]), player)
         self._width = np.broadcast_to(high - low, (about["players"], about["controls"]))[self._others]
 
     def act(self, tau: float, x: ArrayLike) -> Reals:
-        """Its control (m,) with tau seconds to go at states (P, n)."""
-        if self._acts == "mean":
+        """Its control (m,) with tau seconds to go at states (P, n). Raises as `Many`."""
+        if self._mean:
             self._many.replace(len(self.types), self.belief @ self.types)
-        self._answers = self._many(tau, x)
-        return self._answers[-1 if self._acts == "mean" else self.belief.argmax(), self._player]
+        answers = self._many(tau, x)
+        self._predicted = answers[: len(self.types), self._others]
+        return answers[-1 if self._mean else self.belief.argmax(), self._player]
 
     def observe(self, u: ArrayLike, dt: float) -> None:
-        """What all players did since, (P, m), for dt, s; its own entry is not looked at."""
-        predicted = self._answers[: len(self.types), self._others]
-        miss = (np.asarray(u)[self._others] - predicted) / self._width
+        """What all players did since, (P, m), for dt, s; its own entry is not looked at.
+
+        Raises:
+            RuntimeError: it has not acted yet.
+        """
+        if self._predicted is None:
+            raise RuntimeError("Nothing was predicted yet: call `act` first.")
+        miss = (np.asarray(u)[self._others] - self._predicted) / self._width
         self.belief = self._learning.updated(self.belief, miss.reshape(len(self.types), -1), dt)

@@ -145,7 +145,7 @@ class _ManyInC(Many):
         _accepted(library.glue_prepare(len(theta), _pointer(theta), self._to[0]))
 
     def replace(self, row: int, theta: NDArray[Any]) -> None:
-        """Other types (P,) in the place of some."""
+        """As `Many`."""
         super().replace(row, theta)
         _accepted(self._library.glue_prepare(1, _pointer(self._theta[row]), _pointer(self._prepared[row])))
 
@@ -186,7 +186,7 @@ def _compiled(folder: Path) -> ctypes.CDLL:
     with tempfile.TemporaryDirectory() as made:
         library, glue = Path(made) / "controller.so", Path(made) / "glue.c"
         glue.write_text(_GLUE, encoding="utf-8")
-        flags = ["-std=c99", "-O2", "-shared", "-fPIC", f"-I{folder.absolute()}", "-o", str(library)]
+        flags = ["-std=c99", "-O3", "-shared", "-fPIC", f"-I{folder.absolute()}", "-o", str(library)]
         sources = [str(folder.absolute() / "hno_controller.c"), str(glue), "-lm"]
         ended = subprocess.run([compiler, *flags, *sources], capture_output=True, text=True, check=False)
         if ended.returncode:
