@@ -32,7 +32,7 @@ from torch import Tensor
 
 import hno
 from hno.control import Feedback, Policy
-from hno.control.belief import Believing, FixedBelief, Learning
+from hno.control.belief import ACTS, Believing, FixedBelief, Learning
 from hno.control.rollout import Disturbance, rollout
 from hno.data.certificates import safe
 from hno.data.labels import Request, default_cache, safe_labels_for
@@ -117,10 +117,8 @@ def arms(policy: Feedback, types: int, learning: Learning) -> dict[str, Arm]:
         "worst case": fixed(policy, lambda starts: box.hi.expand_as(starts.theta)),
         "mean of the prior": fixed(policy, lambda starts: middle.expand_as(starts.theta)),
         "far end": fixed(policy, lambda starts: torch.where(starts.theta > middle, box.lo, box.hi)),
-        "learned: mean": learned("mean"),
-        "learned: mode": learned("mode"),
-        "learned: expectation": learned("expectation"),
-        "learned: mean, common": learned("mean", common=True),
+        **{f"learned: {acts}": learned(acts) for acts in ACTS},
+        **{f"learned: {acts}, common": learned(acts, common=True) for acts in ACTS},
         "one learns: mean": learned("mean", (0,)),
         "one learns: mean, common": learned("mean", (0,), common=True),
     }
@@ -236,20 +234,27 @@ def paired(policy: Feedback, starts: Starts, options: argparse.Namespace) -> Ite
     known = part(play(policy, lambda some: policy, starts, options).episodes, row)
     every = starts.part(row)._replace(believed=priors.repeat(len(starts.x0), 1))
 
-    def learned(some: Starts) -> Policy:
+    def learned(some: Starts, common: bool) -> Policy:
         near = (grid - some.believed.unsqueeze(-1)).abs().argmin(-1).flip(-1)
         sure = torch.nn.functional.one_hot(near, options.types).double()
         prior = SURE * sure + (1 - SURE) / options.types
-        return Watched(Believing(policy, options.types, "mean", learning_of(options), prior))
+        return Watched(Believing(policy, options.types, "mean", learning_of(options), prior, common))
 
     off = (every.believed - every.theta).abs().amax(-1).round()
     groups = {"0": off == 0, "1": off == 1, "2": off == 2, "3 or 4": off >= 3, "any": off >= 0}
-    for name, arm in {"kept": fixed(policy, lambda some: some.believed), "learned: mean": learned}.items():
+    chosen: dict[str, Arm] = {
+        "kept": fixed(policy, lambda some: some.believed),
+        "learned: mean": lambda some: learned(some, common=False),
+        "learned: mean, common": lambda some: learned(some, common=True),
+    }
+    for name, arm in chosen.items():
+        if options.only and name not in options.only:
+            continue
         played = play(policy, arm, every, options)
         for group, some in groups.items():
             belief = None if played.belief is None else played.belief[some]
-            chosen = Played(part(played.episodes, some), belief, played.learners)
-            yield f"{name}, off by {group}", row_of(chosen, part(known, some), grid, every.part(some))
+            own = Played(part(played.episodes, some), belief, played.learners)
+            yield f"{name}, off by {group}", row_of(own, part(known, some), grid, every.part(some))
 
 
 def learning_of(options: argparse.Namespace) -> Learning:

@@ -197,6 +197,11 @@ class Believing(Policy):
         return respond(states, costate[:, :, :count]), respond(states[:, :, :1], mean).squeeze(2)
 
 
+def all_learning(policy: Policy, game: Game, acts: str) -> Believing:
+    """Players who all learn, and know that of each other; see `Believing`."""
+    return Believing(policy, acts=acts, common=True, game=game)
+
+
 def _ask(answer: Callable[..., Any], types: Tensor, *parts: Tensor) -> Any:
     """What a function says of the rows of types (B, P, R, P), each with its part (B, ...) of the others, in one row."""
     each = math.prod(types.shape[1:3])

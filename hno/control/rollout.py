@@ -9,7 +9,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from hno.control.belief import FixedBelief
+from hno.control.belief import FixedBelief, all_learning
 from hno.control.disturbance import Disturbance, believed, control_noise, normal, state_push
 from hno.control.policy import Policy, as_policy
 from hno.control.questions import starts
@@ -124,7 +124,17 @@ def _played(
 
 
 def _believing(game: Game, policy: Policy, x0: Tensor, theta: Tensor, disturbance: Disturbance) -> Policy:
-    """The policy of players who act on their own estimates of types."""
+    """The policy of players who act on their own estimates of types.
+
+    Raises:
+        ValueError: they are to learn types about which they are to be mistaken, or see `hno.control.belief.Believing`.
+    """
+    if disturbance.belief and disturbance.learns:
+        raise ValueError(
+            "Players who learn types (learns) are not mistaken about them throughout (belief): choose one."
+        )
+    if disturbance.learns:
+        return all_learning(policy, game, disturbance.learns)
     if disturbance.belief == 0:
         return policy
     drawn = normal("belief", disturbance.seed, x0, theta, (game.players, game.players))
