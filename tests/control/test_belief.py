@@ -16,6 +16,7 @@ from torch import Tensor
 import hno
 from hno.control import Feedback
 from hno.control.belief import Believing, FixedBelief, Learning
+from hno.control.disturbance import Disturbance
 from hno.control.policy import as_policy
 from hno.games import Game, make
 from hno.operators import Choice, make_operator
@@ -415,3 +416,21 @@ def test_nobody_has_a_belief_about_itself(observer: int, player: int) -> None:
 
 def test_weights_are_scaled_to_probabilities() -> None:
     np.testing.assert_allclose(distribution([1, 3], (2, 2)), [[0.25, 0.75]] * 2)
+
+
+def test_a_rollout_of_players_who_learn_is_one_of_common_beliefs() -> None:
+    theta = GAME.type_box.sample(4, torch.Generator().manual_seed(3))
+    x = starts(GAME, 4)
+    learned = hno.rollout(GAME, revealing, x, theta, dt=0.1, disturbance=Disturbance(learns="mode"))
+    policy = Believing(revealing, acts="mode", common=True, game=GAME)
+    assert torch.equal(learned.u, hno.rollout(GAME, policy, x, theta, dt=0.1).u)
+    assert not torch.equal(learned.u, hno.rollout(GAME, revealing, x, theta, dt=0.1).u)
+
+
+def test_who_learns_is_not_wrong_throughout() -> None:
+    with pytest.raises(ValueError, match="choose one"):
+        play_disturbed(Disturbance(learns="mean", belief=0.5))
+
+
+def play_disturbed(disturbance: Disturbance) -> Trajectory:
+    return hno.rollout(GAME, revealing, starts(GAME, 1), torch.ones(1, 2), dt=0.1, disturbance=disturbance)
