@@ -1,7 +1,8 @@
 """How long an exported controller takes: `python benchmarks/latency.py [RUN|CHECKPOINT] [CALLS]`.
 
 One thread, one state that moves a little, types that stay as they are, so what they determine is prepared: median, p99
-and p99.9 of each call in microseconds, beside a loop that calls nothing. Then states per second in batches, and what
+and p99.9 of each call in microseconds, beside a loop that calls nothing; "belief" is one step of `hno.runtime.Believer`
+with 625 candidates, which acts on their mean and learns from what it sees. Then states per second in batches, and what
 `import hno.runtime` adds to NumPy's own import. Without a checkpoint it is the default operator of narrow_road with
 random weights, which takes as long. The last line is JSON; its torch is the exported program.
 """
@@ -27,7 +28,7 @@ from hno.control import Feedback
 from hno.export.trace import points
 from hno.games import make
 from hno.operators import Architecture, Choice, make_operator
-from hno.runtime import load
+from hno.runtime import Believer, Learning, load
 from hno.training.checkpoint import load_policy
 
 BATCHES = 1, 64, 4096
@@ -75,6 +76,9 @@ def main(path: str | None, calls: int) -> None:
             found[name] = _row(name, times)
         for name, call in _in_python(folders, policy).items():
             found[name] = _row(name, _timed(call, calls // 20 if name.startswith("PyTorch policy") else calls))
+        beliefs = {kind: _timed(_believing(folders[kind], policy), calls // 100) for kind in ("c", "numpy")}
+        for kind, times in beliefs.items():
+            _row(f"belief over {TYPES} types, {kind}", times)
         print(f"\n{'states a second, in batches of':<44}" + "".join(f"{size:>9}" for size in BATCHES))
         for kind, folder in folders.items():
             _throughput(kind, load(folder).answers, policy)
@@ -84,7 +88,8 @@ def main(path: str | None, calls: int) -> None:
         _on_gpu(policy)
     names = {"c_p99_us": "C, prepared", "numpy_p99_us": "NumPy, prepared", "onnx_p99_us": "ONNX, prepared",
              "torch_p99_us": "torch program, eager, prepared"}  # fmt: skip
-    print(json.dumps({key: round(found[name], 2) for key, name in names.items()}))
+    rates = {f"belief_{kind}_hz": round(1e6 / float(np.median(times))) for kind, times in beliefs.items()}
+    print(json.dumps({key: round(found[name], 2) for key, name in names.items()} | rates))
 
 
 def _stand_in() -> Any:
@@ -153,6 +158,16 @@ def _in_python(folders: dict[str, Path], policy: Feedback) -> dict[str, Callable
         "torch program, eager, everything": lambda: program(tau, x, theta),
         "PyTorch policy, as trained": lambda: policy.act(tau, x, theta),
     }
+
+
+def _believing(folder: Path, policy: Feedback) -> Callable[[], object]:
+    """One step of the first player: it acts, and learns from what all do."""
+    tau, x, theta = (part[0].numpy() for part in _question(policy))
+    box = policy.game.type_box
+    types = np.tile(theta, (TYPES, 1))
+    types[:, 1] = np.linspace(float(box.lo[1]), float(box.hi[1]), TYPES)
+    player, seen = Believer(load(folder), 0, types, learning=Learning(floor=1e-5)), policy.act(tau, x, theta)
+    return lambda: (player.act(float(tau), x), player.observe(seen, 0.002))
 
 
 def _timed(call: Callable[[], object], calls: int) -> list[float]:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from hno import games
     from hno.cli.calls import evaluate, train
+    from hno.control.belief import Believing
     from hno.control.exported import load_exported
     from hno.control.rollout import rollout
     from hno.games.testing import check_game
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 __all__ = [
+    "Believing",
     "__version__",
     "check_game",
     "evaluate",
@@ -33,6 +35,7 @@ __all__ = [
 ]
 
 _PLACES = {
+    "Believing": "hno.control.belief:Believing",
     "check_game": "hno.games.testing:check_game",
     "evaluate": "hno.cli.calls:evaluate",
     "fit": "hno.training.fit:fit",

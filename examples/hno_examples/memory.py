@@ -1,4 +1,7 @@
-"""A policy with memory: the players infer each other's types from how they move."""
+"""A policy with memory: the players infer each other's types from how they move.
+
+The shortest one, to show `observe`; `hno.Believing` is for any number of players, forgets, and recovers.
+"""
 
 from __future__ import annotations
 

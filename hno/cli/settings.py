@@ -163,6 +163,7 @@ class EvaluateSettings(Episodes):
     expected_game: Text | None
     theta: Loose | None
     unseen: Loose | None
+    learns: Literal["mean", "mode", "expectation"] | None
     residuals: bool
     robustness: bool
     conditions: dict[str, Any]

@@ -36,6 +36,9 @@ class Disturbance(NamedTuple):
     belief: float = 0.0
     """By how much every player is mistaken about each other player's type throughout an episode, in widths of the type
     box; up or down by chance, but inwards where the type box ends. Its own type it knows."""
+    learns: str | None = None
+    """Every player knows its own type alone and learns those of the others: what it acts on, see
+    `hno.control.belief.all_learning`."""
 
 
 def control_noise(game: Game, x0: Tensor, theta: Tensor, steps: int, disturbance: Disturbance) -> Tensor | None:

@@ -9,6 +9,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from hno.control.belief import FixedBelief, all_learning
 from hno.control.disturbance import Disturbance, believed, control_noise, normal, state_push
 from hno.control.policy import Policy, as_policy
 from hno.control.questions import starts
@@ -123,39 +124,21 @@ def _played(
 
 
 def _believing(game: Game, policy: Policy, x0: Tensor, theta: Tensor, disturbance: Disturbance) -> Policy:
-    """The policy of players who act on their own estimates of types."""
+    """The policy of players who act on their own estimates of types.
+
+    Raises:
+        ValueError: they are to learn types about which they are to be mistaken, or see `hno.control.belief.Believing`.
+    """
+    if disturbance.belief and disturbance.learns:
+        raise ValueError(
+            "Players who learn types (learns) are not mistaken about them throughout (belief): choose one."
+        )
+    if disturbance.learns:
+        return all_learning(policy, game, disturbance.learns)
     if disturbance.belief == 0:
         return policy
     drawn = normal("belief", disturbance.seed, x0, theta, (game.players, game.players))
-    return _Believing(policy, believed(game, theta, drawn, disturbance.belief).flatten(0, 1))
-
-
-class _Believing(Policy):
-    """Each player asks the policy about the types that it believes in, and plays its own part of the answer.
-
-    Args:
-        policy: asked once for every player.
-        estimates: what each player takes all types to be, players running fastest, (B P, P).
-    """
-
-    def __init__(self, policy: Policy, estimates: Tensor) -> None:
-        self.policy, self.estimates, self.players = policy, estimates, estimates.shape[-1]
-
-    def _each(self, part: Tensor) -> Tensor:
-        return part.repeat_interleave(self.players, 0)
-
-    def reset(self, x0: Tensor, theta: Tensor) -> None:
-        """An episode begins."""
-        self.policy.reset(self._each(x0), self.estimates)
-
-    def act(self, tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
-        """Controls, (B, P, m)."""
-        answers = self.policy.act(self._each(tau), self._each(x), self.estimates).unflatten(0, theta.shape)
-        return answers.diagonal(dim1=1, dim2=2).mT
-
-    def observe(self, x: Tensor, u: Tensor, dt: float) -> None:
-        """What happened."""
-        self.policy.observe(self._each(x), self._each(u), dt)
+    return FixedBelief(policy, believed(game, theta, drawn, disturbance.belief).flatten(0, 1))
 
 
 def _between(start: Tensor, end: Tensor, points: int) -> Tensor:

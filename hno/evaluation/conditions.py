@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
+from hno.control.belief import ACTS
 from hno.control.disturbance import Disturbance, pushed_states
 from hno.games import Game
 from hno.registry import unknown_name
@@ -55,6 +56,7 @@ ENTRIES: Mapping[str, tuple[str, Callable[[Any], bool]]] = {
         lambda value: value is None or (isinstance(value, Sequence) and all(type(place) is int for place in value)),
     ),
     "belief": _AMOUNT,
+    "learns": (f"{', '.join(ACTS)} or null", lambda value: value is None or value in ACTS),
 }
 """What a configuration may say of a condition: what each entry must be, in words and as a test."""
 
@@ -96,7 +98,13 @@ def read_condition(game: Game, entries: Mapping[Any, Any], base: Condition, plac
             raise ValueError(f"{place}{entry} must be {wanted}; got {value!r}.")
     pushed_states(game, entries.get("components"))
     chosen: dict[str, Any] = {
-        name: tuple(value) if isinstance(value, Sequence) else value for name, value in entries.items()
+        name: tuple(value) if isinstance(value, Sequence) and name != "learns" else value
+        for name, value in entries.items()
     }
     own: dict[str, Any] = {name: chosen.pop(name) for name in Condition._fields if name in chosen}
-    return base._replace(**own, disturbance=base.disturbance._replace(**chosen))
+    disturbance = base.disturbance._replace(**chosen)
+    if disturbance.learns and disturbance.belief:
+        raise ValueError(
+            f"{place}learns and {place}belief exclude each other: who learns types is not wrong throughout."
+        )
+    return base._replace(**own, disturbance=disturbance)

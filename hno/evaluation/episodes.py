@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from hno.control.belief import Believing, all_learning
 from hno.data.branches import rotations
 from hno.data.certificates import safe
 from hno.evaluation.sections import Evaluation
@@ -30,8 +31,9 @@ def episodes(evaluation: Evaluation, found: Extremal, played: Trajectory) -> lis
 
     Returns:
         JSON content: positions of all players over time, the distance below which it is a collision where the
-        constraint is one, the branch of a potential that is played, the path of the equilibrium from the same start and
-        whether players pass on another side than there, costs. Nothing without a start that counts.
+        constraint is one, the branch of a potential that is played, what is believed of types where players learn, the
+        path of the equilibrium from the same start and whether players pass on another side than there, costs. Nothing
+        without a start that counts.
     """
     counted = safe(found, evaluation.clearance).nonzero().squeeze(-1)
     if len(counted) == 0:
@@ -65,6 +67,7 @@ def _episode(evaluation: Evaluation, played: Trajectory, label: Extremal, row: i
         "t": _rounded(t),
         "positions": _rounded(places),
         "branch": _branches(evaluation, Points(game.horizon - t, played.x[row, frames], theta.expand(len(t), -1))),
+        "belief": _belief(evaluation, played, theta, row, frames),
         "other_side": _other_side(game, played.x[row], label.x[row]),
         "radius": None if apart is None else _rounded(violation[frames] + apart),
         "label_positions": _rounded(_at(t, label.t, game.positions(label.x[row].to(places)))),
@@ -75,6 +78,38 @@ def _branches(evaluation: Evaluation, points: Points) -> list[int] | None:
     """The branch that is played at each point; None for an operator without branches."""
     field = evaluation.policy.operator.field(points)
     return field.branches.argmax(-1).tolist() if isinstance(field, PotentialField) else None
+
+
+def _belief(evaluation: Evaluation, played: Trajectory, theta: Tensor, row: int, frames: Sequence[int]) -> Any:
+    """What the others believe of each player's type, where they learn: mean, and ends of the central 90 %, (F, P, 3).
+
+    Beliefs follow from the motion: they are found again along the path.
+    """
+    acts, game = evaluation.condition.disturbance.learns, evaluation.game
+    if acts is None or game.players == 1:
+        return None
+    watching, types, dt = all_learning(evaluation.policy, game, acts), theta.unsqueeze(0), evaluation.dt
+    x, u = played.x[row].unsqueeze(1), played.u[row].unsqueeze(1)
+    watching.reset(x[0], types)
+    said = [_said(watching)]
+    for k in range(len(u)):
+        watching.act(played.t[-1] - played.t[k : k + 1], x[k], types)
+        watching.observe(x[k + 1], u[k], dt)
+        said.append(_said(watching))
+    return _rounded(torch.stack(said)[frames])
+
+
+def _said(watching: Believing) -> Tensor:
+    """Mean, 5 % and 95 % quantile of what the others believe of each type, on average, (P, 3)."""
+    players = range(watching.game.players)
+    others = [[watching.marginal(i, j)[0] for i in players if i != j] for j in players]
+    mixed = torch.stack([torch.stack(own).mean(0) for own in others])
+    below = mixed.cumsum(-1)
+    ends = [
+        watching.grid.gather(1, (below < share).sum(-1, keepdim=True).clamp(max=mixed.shape[1] - 1))
+        for share in (0.05, 0.95)
+    ]
+    return torch.cat([(mixed * watching.grid).sum(-1, keepdim=True), *ends], -1)
 
 
 def _other_side(game: Game, played: Tensor, label: Tensor) -> bool:

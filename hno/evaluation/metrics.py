@@ -42,6 +42,13 @@ def saturated_share(u: Tensor, box: Box, tolerance: float = 1e-4) -> Tensor:
     return (inside <= tolerance).double().flatten(1).mean(1)
 
 
+def credible(belief: Tensor, share: float = 0.9) -> Tensor:
+    """The smallest set of candidates that has at least a share of the belief, the most likely first, bool, (..., C)."""
+    falling, order = belief.sort(dim=-1, descending=True, stable=True)
+    before = falling.cumsum(-1) - falling
+    return (before < share).take_along_dim(order.argsort(dim=-1), -1)
+
+
 def clopper_pearson(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float] | None:
     """Exact interval of a binomial rate; None without trials."""
     if trials == 0:

@@ -189,6 +189,32 @@ def separation(frames: Any, frame: int = 0) -> Layers:
     )
 
 
+def beliefs(frames: Any, frame: int = 0) -> Layers:
+    """What is believed of every type over time: mean and 90 %, beside the type, dashed; one frame is marked."""
+    base = (
+        alt.Chart(frames)
+        .transform_filter("isValid(datum.mean)")
+        .transform_calculate(player="sequence(1, length(datum.mean) + 1)")
+        .transform_flatten(["player", "mean", "low", "high", "type"])
+        .encode(
+            x=alt.X("t:Q", title="t [s]", axis=alt.Axis(grid=False, tickCount=5)),
+            color=alt.Color("player:N", legend=None),
+        )
+    )
+    height = alt.Y("mean:Q", title="believed type", scale=alt.Scale(zero=False), axis=alt.Axis(grid=False, tickCount=4))
+    now = alt.Chart(frames).transform_filter("datum.frame === frame").encode(x="t:Q")
+    return (
+        alt.layer(
+            base.mark_area(opacity=0.15).encode(y=alt.Y("low:Q", title="believed type"), y2="high:Q"),
+            base.mark_line(strokeDash=[5, 4], strokeWidth=1.5, opacity=0.7).encode(y="type:Q"),
+            base.mark_line(strokeWidth=1.8).encode(y=height),
+            now.mark_rule(color=alt.expr("muted"), strokeDash=[3, 3]),
+        )
+        .properties(width="container", height=110)
+        .add_params(*colors(), alt.param(name="frame", value=frame))
+    )
+
+
 @functools.cache
 def specifications() -> dict[str, Any]:
     """Vega specifications of the page's charts, without data and colours."""
@@ -196,6 +222,6 @@ def specifications() -> dict[str, Any]:
     charts = {
         "heat": heat_map(cells), "comparison": comparison(rows), "log": learning_curves(points, "log"),
         "linear": learning_curves(points, "linear"), "top": encounter(frames, "y"), "side": encounter(frames, "z"),
-        "separation": separation(frames),
+        "separation": separation(frames), "beliefs": beliefs(frames),
     }  # fmt: skip
     return {name: vega.compiled(chart) for name, chart in charts.items()}

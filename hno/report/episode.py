@@ -33,6 +33,8 @@ class Episode(BaseModel):
     """Distance below which it is a collision, m, (F,); None where the constraint is no distance."""
     branch: Array | None = None
     """Branch of a potential that is played, (F,); None where there are none."""
+    belief: Array | None = None
+    """What the others believe of each player's type, where they learn: mean and ends of 90 %, (F, P, 3)."""
     other_side: bool = False
     """Whether two players pass each other on another side than along the equilibrium."""
     label_positions: Array | None = None
@@ -53,7 +55,8 @@ def episode(content: Any) -> Episode:
     found = Episode.model_validate(content)
     arrays = {name: value for name, value in found if isinstance(value, np.ndarray)}
     places = (*found.t.shape, *found.positions.shape[1:])
-    wanted = {name: places if "positions" in name else places[:1] for name in arrays}
+    shape_of = {"belief": (*places[:2], 3), "positions": places, "label_positions": places}
+    wanted = {name: shape_of.get(name, places[:1]) for name in arrays}
     shapes = {name: array.shape for name, array in arrays.items()}
     if len(places) != 3 or places[2] not in (2, 3) or any(shape != wanted[name] for name, shape in shapes.items()):
         raise ValueError(f"arrays have shapes {shapes}, expected (F,) or (F, P, 2 or 3)")
@@ -86,12 +89,16 @@ def closest(found: Episode) -> int:
 def frames(found: Episode) -> list[dict[str, Any]]:
     """A row for every frame: frame, t (s), distance and radius (m, or None), branch (or None), lists over players.
 
-    The lists are x, y and, in space, z; label_x and so on along the equilibrium, if that is known.
+    The lists are x, y and, in space, z; label_x and so on along the equilibrium, if that is known; where players learn,
+    each one's type and what is believed of it: mean, low, high.
     """
     columns = {"t": found.t, "distance": distances(found), "radius": found.radius, "branch": found.branch}
     for prefix, path in (("", found.positions), ("label_", found.label_positions)):
         if path is not None:
             columns |= {f"{prefix}{axis}": path[..., i] for i, axis in enumerate("xyz"[: path.shape[2]])}
+    if found.belief is not None:
+        columns |= {name: found.belief[..., k] for k, name in enumerate(("mean", "low", "high"))}
+        columns["type"] = np.broadcast_to(found.theta, found.belief.shape[:2])
     lists = [[None] * len(found.t) if one is None else one.round(3).tolist() for one in columns.values()]
     return [{"frame": k, **dict(zip(columns, row, strict=True))} for k, row in enumerate(zip(*lists, strict=True))]
 

@@ -20,7 +20,7 @@ Row = Mapping[str, Any]
 """A row of the collision table: the entries of `TypeRow` and its `Outcome`."""
 CONSTANTS = "game.constants."
 """What settings that are constants of a game begin with."""
-PLAY = ("clearance", "dt", "widen", "noise", "delay")
+PLAY = ("clearance", "dt", "widen", "noise", "delay", "learns")
 """Fields of `Run` that say how episodes were played; their defaults go without saying."""
 
 
@@ -50,6 +50,7 @@ class Run(BaseModel):
     widen: float = 1
     noise: float = 0
     delay: int = 0
+    learns: str | None = None
     test_seed: int | None = None
     table: SkipValidation[list[Row]]
     """One row for every type."""
@@ -77,7 +78,9 @@ class Run(BaseModel):
         usual = type(self).model_fields
         play = {name: getattr(self, name) for name in PLAY if getattr(self, name) != usual[name].default}
         said = [f"{name} {text}" for name, text in sorted(constants.items())]
-        return ", ".join(said + [f"{name} {value:g}" for name, value in play.items()])
+        return ", ".join(
+            said + [f"{name} {value if isinstance(value, str) else f'{value:g}'}" for name, value in play.items()]
+        )
 
     @property
     def entries(self) -> Mapping[str, Any]:

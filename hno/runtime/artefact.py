@@ -116,8 +116,58 @@ class Artefact(abc.ABC):
             return {name: np.zeros((0, *shape), np.float32) for name, shape in self.about["outputs"].items()}
         return self._answers(*given)
 
+    def many(self, theta: ArrayLike) -> Many:
+        """The controls that many types have at one state, (K, P).
+
+        Raises:
+            ValueError: another shape, or entries that are not finite.
+        """
+        types = np.array(theta, np.float32)
+        if types.ndim != 2 or types.shape[1] != self.about["players"] or not np.isfinite(types).all():
+            raise ValueError(f"types must be finite, of shape (K, {self.about['players']}); got {types.shape}.")
+        return self._many(types)
+
+    def _many(self, theta: NDArray[np.float32]) -> Many:
+        """As `many`, of sound types: a batch of equal states, where a kind knows no better."""
+        return Many(self, theta)
+
     @abc.abstractmethod
     def _answers(
         self, tau: NDArray[np.float32], x: NDArray[np.float32], theta: NDArray[np.float32]
     ) -> dict[str, NDArray[np.float32]]:
         """As `answers`, of a sound question with at least one row."""
+
+
+class Many:
+    """The controls that many types have at one state.
+
+    Args:
+        artefact: the controller.
+        theta: types, (K, P), float32.
+    """
+
+    def __init__(self, artefact: Artefact, theta: NDArray[np.float32]) -> None:
+        self._artefact, self._theta = artefact, theta
+
+    def replace(self, row: int, theta: NDArray[Any]) -> None:
+        """Other types (P,) in the place of some.
+
+        Raises:
+            ValueError: an entry is not finite.
+        """
+        if not np.isfinite(theta).all():
+            raise ValueError(f"types must be finite; got {theta}.")
+        self._theta[row] = theta
+
+    def __call__(self, tau: float, x: ArrayLike) -> NDArray[np.float32]:
+        """Controls (K, P, m) with tau seconds to go at states (P, n).
+
+        Raises:
+            ValueError: the controller refuses the question, see `Artefact.answers`, or has no finite answer.
+        """
+        count = len(self._theta)
+        states = np.broadcast_to(np.asarray(x, np.float32), (count, *np.shape(x)))
+        found = self._artefact.answers(np.full(count, tau, np.float32), states, self._theta)["control"]
+        if not np.isfinite(found).all():
+            raise ValueError("There is no finite control at this state: it is too far outside the PDE box.")
+        return found

@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
-from hno.runtime.artefact import Artefact, ArtefactError, read_manifest
+from hno.runtime.artefact import Artefact, ArtefactError, Many, read_manifest
 
 if TYPE_CHECKING:
     import ctypes
     from types import CodeType
 
-    from numpy.typing import NDArray
+    from numpy.typing import ArrayLike, NDArray
 
     Reals = NDArray[np.float32]
 
@@ -122,12 +122,52 @@ class _C(Artefact):
         shapes = self.about["outputs"].items()
         return {name: part.reshape(-1, *shape) for (name, shape), part in zip(shapes, parts, strict=True)}
 
+    def _many(self, theta: Reals) -> Many:
+        return _ManyInC(self, theta, self._library)
+
     def _call(self, name: str, count: int, *arrays: NDArray[Any]) -> None:
+        _accepted(getattr(self._library, name)(count, *map(_pointer, arrays)))
+
+
+@final
+class _ManyInC(Many):
+    """What types do not change is computed once for all of them, and what they alone determine once for all states."""
+
+    def __init__(self, artefact: Artefact, theta: Reals, library: ctypes.CDLL) -> None:
         import ctypes
 
-        code = getattr(self._library, name)(count, *(array.ctypes.data_as(ctypes.c_void_p) for array in arrays))
-        if code < 0:
-            raise ValueError(f"The controller refused with code {code}; see hno_controller.h.")
+        super().__init__(artefact, theta)
+        about, self._library, self._real = artefact.about, library, ctypes.c_float
+        self._prepared = np.zeros((len(theta), library.glue_prepared()), np.uint8)
+        self._states = about["players"], about["states"]
+        self._controls = np.zeros((len(theta), about["players"], about["controls"]), np.float32)
+        self._to = _pointer(self._prepared), _pointer(self._controls)
+        _accepted(library.glue_prepare(len(theta), _pointer(theta), self._to[0]))
+
+    def replace(self, row: int, theta: NDArray[Any]) -> None:
+        """As `Many`."""
+        super().replace(row, theta)
+        _accepted(self._library.glue_prepare(1, _pointer(self._theta[row]), _pointer(self._prepared[row])))
+
+    def __call__(self, tau: float, x: ArrayLike) -> Reals:
+        """As `Many`."""
+        state, (prepared, controls) = np.ascontiguousarray(x, np.float32), self._to
+        if state.shape != self._states:
+            raise ValueError(f"Expected one state of shape {self._states}; got {state.shape}.")
+        found = len(self._prepared), self._real(tau), _pointer(state), None, None, controls
+        _accepted(self._library.hno_many_types(prepared, *found))
+        return self._controls.copy()
+
+
+def _accepted(code: int) -> None:
+    if code < 0:
+        raise ValueError(f"The controller refused with code {code}; see hno_controller.h.")
+
+
+def _pointer(array: NDArray[Any]) -> ctypes.c_void_p:
+    import ctypes
+
+    return ctypes.c_void_p(array.ctypes.data)
 
 
 def _compiled(folder: Path) -> ctypes.CDLL:
@@ -146,7 +186,7 @@ def _compiled(folder: Path) -> ctypes.CDLL:
     with tempfile.TemporaryDirectory() as made:
         library, glue = Path(made) / "controller.so", Path(made) / "glue.c"
         glue.write_text(_GLUE, encoding="utf-8")
-        flags = ["-std=c99", "-O2", "-shared", "-fPIC", f"-I{folder.absolute()}", "-o", str(library)]
+        flags = ["-std=c99", "-O3", "-shared", "-fPIC", f"-I{folder.absolute()}", "-o", str(library)]
         sources = [str(folder.absolute() / "hno_controller.c"), str(glue), "-lm"]
         ended = subprocess.run([compiler, *flags, *sources], capture_output=True, text=True, check=False)
         if ended.returncode:

@@ -46,7 +46,7 @@ def test_symmetric_starts_have_labels_of_their_own(tmp_path: Path) -> None:
 
 
 def test_a_condition_says_what_is_unusual_about_it() -> None:
-    entries = {"symmetric": True, "widen": 2, "noise": 0.2, "delay": 3, "components": [1]}
+    entries = {"symmetric": True, "widen": 2, "noise": 0.2, "delay": 3, "components": [1], "learns": "mean"}
     condition = read_condition(make("narrow_road"), entries, Condition("any", disturbance=Disturbance(seed=7)))
     assert condition.entries() == entries | {"components": (1,)}
     assert condition.starts == (2, True, False)

@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from hno.control.belief import Believing
 from hno.control.rollout import Player
 from hno.evaluation.closed_loop import play
 from hno.evaluation.episodes import FRAMES, episodes, together
@@ -15,7 +16,7 @@ from hno.evaluation.outcome import numbers_of, outcome
 from hno.games import Game, make
 from hno.games.kinematics import separation
 from hno.types import Extremal, Points, PotentialField, Trajectory
-from tests.fakes import evaluation_of, fake_labels
+from tests.fakes import Controller, evaluation_of, fake_labels
 from tests.lq import LinearQuadratic
 from tests.walkers import Walkers
 
@@ -163,3 +164,33 @@ def test_where_the_constraint_is_no_distance_there_is_no_radius(sets: list[Extre
     kept = kept_of(game, straight, sets)
     assert kept["constraint_unit"] == ""
     assert all(episode["radius"] is None for episode in kept["episodes"])
+
+
+def test_beliefs_along_an_episode_are_those_that_were_played_with(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are found again from the path; without learning there are none."""
+
+    def revealing(tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
+        return torch.stack([4 + 0.1 * theta, 0.05 * theta.flip(-1)], -1)
+
+    labels = [labelled([0.9, 0.8], [0.5, 0.5], 3.0)]
+    past, observe = list[Tensor](), Believing.observe
+
+    def watched(self: Believing, x: Tensor, u: Tensor, dt: float) -> None:
+        observe(self, x, u, dt)
+        past.append(self.belief)
+
+    policy = Controller(Walkers(), revealing)
+    with monkeypatch.context() as patch:
+        patch.setattr(Believing, "observe", watched)
+        evaluation = evaluation_of(Walkers(), policy, labels, learns="mean", noise=0.1)
+        played = next(play(Walkers(), policy, labels, 0.02, evaluation.condition.disturbance))[1]
+    kept = episodes(evaluation, labels[0], played)[0]
+    row = int(played.distance.argmin())
+    grid = Believing(revealing, game=Walkers()).grid[0].double()
+    means = torch.tensor(kept["belief"])[..., 0]
+    assert means[0].tolist() == [2.0, 2.0]
+    torch.testing.assert_close(means[-1].double(), (past[-1][row] * grid).sum(-1).flip(-1), atol=1e-3, rtol=0)
+    low, high = torch.tensor(kept["belief"])[..., 1], torch.tensor(kept["belief"])[..., 2]
+    assert ((low <= means + 1e-3) & (means <= high + 1e-3)).all()
+    assert (high - low)[-1].max() < (high - low)[0].min(), "something was learned"
+    assert kept_of(Walkers(), revealing, labels)["episodes"][0]["belief"] is None

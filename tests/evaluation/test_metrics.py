@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from hno.evaluation.metrics import clopper_pearson, quantiles, saturated_share
+from hno.evaluation.metrics import clopper_pearson, credible, quantiles, saturated_share
 from hno.games import Box, make
 
 
@@ -46,6 +46,21 @@ UNIT = Box([-1.0, 0.0], [1.0, 4.0])
 CONTROLS = torch.lerp(UNIT.lo, UNIT.hi, torch.randint(9, (40, 7, 2, 2), generator=GENERATOR) / 8)
 NUMBERS = torch.randn(40, generator=GENERATOR)
 MEASURED = torch.randn(40, 2, generator=GENERATOR)
+
+
+def test_the_credible_set_is_the_smallest_one() -> None:
+    """Against all subsets, of random beliefs; of equals the first ones are in it."""
+    generator = torch.Generator().manual_seed(0)
+    beliefs = torch.rand(40, 5, generator=generator, dtype=torch.float64).pow(3)
+    beliefs /= beliefs.sum(-1, keepdim=True)
+    subsets = torch.cartesian_prod(*[torch.tensor([False, True])] * 5)
+    chosen = credible(beliefs, 0.9)
+    for belief, found in zip(beliefs, chosen, strict=True):
+        enough = subsets[(subsets * belief).sum(-1) >= 0.9]
+        assert (belief * found).sum() >= 0.9
+        assert found.sum() == enough.sum(-1).min()
+    assert credible(torch.full((4,), 0.25), 0.5).tolist() == [True, True, False, False]
+    assert credible(torch.tensor([0.0, 1.0, 0.0])).tolist() == [False, True, False]
 
 
 def test_quantiles_are_those_of_numpy() -> None:

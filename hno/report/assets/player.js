@@ -16,7 +16,7 @@ async function show() {
   player.frame = player.fresh ? episode.closest : Math.min(player.frame, episode.frames.length - 1);
   player.views = [];
   const scenes = Object.entries(episode.whole).map(([name, whole]) => scene(episode, name, whole, solid));
-  const made = await Promise.all([...scenes, apart(episode)]);
+  const made = await Promise.all([...scenes, apart(episode), believed(episode)]);
   if (player.episode !== episode) return;
   player.views = made.filter(Boolean);
   seek(player.frame);
@@ -32,6 +32,11 @@ function scene({ frames }, name, whole, solid) {
 function apart({ frames }) {
   $("apart").hidden = frames[0].distance === null;
   return $("apart").hidden ? null : draw($("apart"), "separation", { frames }, { frame: player.frame });
+}
+
+function believed({ frames }) {
+  $("believed").hidden = !frames[0].mean;
+  return $("believed").hidden ? null : draw($("believed"), "beliefs", { frames }, { frame: player.frame });
 }
 
 function seek(frame) {
