@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from hno import games
-    from hno.cli.calls import evaluate, train
+    from hno.cli.calls import certify, evaluate, train
     from hno.control.exported import load_exported
     from hno.control.rollout import rollout
     from hno.games.testing import check_game
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 __all__ = [
     "__version__",
+    "certify",
     "check_game",
     "evaluate",
     "fit",
@@ -33,6 +34,7 @@ __all__ = [
 ]
 
 _PLACES = {
+    "certify": "hno.cli.calls:certify",
     "check_game": "hno.games.testing:check_game",
     "evaluate": "hno.cli.calls:evaluate",
     "fit": "hno.training.fit:fit",
