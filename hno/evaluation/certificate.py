@@ -70,7 +70,7 @@ class Plan(NamedTuple):
                 )
 
 
-class Tests(NamedTuple):
+class Trials(NamedTuple):
     """Independent episodes."""
 
     x0: Tensor
@@ -188,17 +188,17 @@ def draw(
     return x0, x0.new_tensor(types)[(kinds[:, 0] * len(types)).long()]
 
 
-def play(policy: Feedback, plan: Plan, split: str) -> Tests:
+def play(policy: Feedback, plan: Plan, split: str) -> Trials:
     """Episodes from starts that are drawn for a purpose."""
     game = policy.game
     x0, theta = draw(game, plan.tests, plan.seed, split, plan.types)
     disturbance = Disturbance(noise=plan.noise, delay=plan.delay, seed=plan.seed)
     parts = zip(x0.split(AT_ONCE), theta.split(AT_ONCE), strict=True)
     hits = [rollout(game, policy, *some, plan.dt, SUBSTEPS, POINTS, disturbance).collided for some in parts]
-    return Tests(x0, theta, torch.cat(hits))
+    return Trials(x0, theta, torch.cat(hits))
 
 
-def safe_bound(tests: Tests, plan: Plan, solve: Solve) -> SafeBound:
+def safe_bound(tests: Trials, plan: Plan, solve: Solve) -> SafeBound:
     """The bound over starts whose equilibrium is safe.
 
     Equilibria are solved from the first tests, which say how many starts are safe, and from all that collide.
@@ -209,6 +209,8 @@ def safe_bound(tests: Tests, plan: Plan, solve: Solve) -> SafeBound:
     kept, lost = torch.zeros_like(asked), torch.zeros_like(asked)
     kept[asked], lost[asked] = safe(found, plan.clearance), found.status != Status.CONVERGED
     hits, unknown = kept & tests.collided, lost & tests.collided
+    bound = conditional_bound(hits, kept, first, plan.beta)
+    worst = conditional_bound(hits | unknown, kept | unknown, first, plan.beta)
     return SafeBound(
         plan.clearance,
         first,
@@ -216,8 +218,8 @@ def safe_bound(tests: Tests, plan: Plan, solve: Solve) -> SafeBound:
         int(lost[:first].sum()),
         int(hits.sum()),
         int(unknown.sum()),
-        conditional_bound(hits, kept, first, plan.beta),
-        conditional_bound(hits | unknown, kept | unknown, first, plan.beta),
+        bound,
+        max(bound, worst),
     )
 
 
@@ -241,7 +243,7 @@ def conditional_bound(hits: Tensor, members: Tensor, first: int, beta: float) ->
     return min(1.0, upper_bound(count, len(hits), beta / 2) / least) if least > 0 else 1.0
 
 
-def region(policy: Feedback, chosen: Tests, tests: Tests, plan: Plan) -> Region | None:
+def region(policy: Feedback, chosen: Trials, tests: Trials, plan: Plan) -> Region | None:
     """The largest region of starts that is found to collide with a probability of at most the target.
 
     Other starts, `chosen`, fix the margin, its levels and their order: from the level that promises most to ever larger
@@ -295,7 +297,7 @@ def ranking(margin: Tensor, collided: Tensor) -> float:
     return float((above + ties / 2).double().mean() / len(free))
 
 
-def margins(policy: Feedback, tests: Tests) -> dict[str, Tensor]:
+def margins(policy: Feedback, tests: Trials) -> dict[str, Tensor]:
     """Every margin of starts that the controller has, (N,)."""
     game = policy.game
     points = Points(torch.full_like(tests.theta[:, 0], game.horizon), tests.x0, tests.theta)

@@ -37,12 +37,12 @@ def _safe(found: SafeBound | None, game: Game, plan: Plan) -> list[str]:
     if found is None:
         return []
     keeps = f"{found.clearance:g} {game.constraint_unit}".strip()
-    counts = f"{found.collisions:,} of {plan.tests:,} tests are such a collision"
-    known = f"{found.safe:,} of {found.solved:,} starts are such, {found.unsolved:,} unsolved"
-    unknown = f"{found.unsolved_collisions:,} of these collide"
+    counts = f"{found.collisions:,} of {plan.tests:,} tests are and collide"
+    known = f"{found.safe:,} of the first {found.solved:,} are, {found.unsolved:,} are unsolved"
+    unknown = f"{found.unsolved_collisions:,} of the unsolved collide"
     return [
         f"at most {text.percent(found.bound)} over starts whose equilibrium keeps {keeps}: {counts}; {known}",
-        f"at most {text.percent(found.worst_bound)} over these if starts without a known equilibrium are: {unknown}",
+        f"at most {text.percent(found.worst_bound)} over these if unsolved ones may be among them: {unknown}",
     ]
 
 
@@ -56,14 +56,10 @@ def _region(found: Region | None, plan: Plan) -> str:
 
 def _confidence(found: Certificate, made: int) -> list[str]:
     beta, number = found.plan.beta, found.statements
-    said = [
-        f"Each of these {number} statements holds with confidence 1 - {beta:g}, all together 1 - {number * beta:g}."
-    ]
+    said = [f"Each of these {number} holds with confidence 1 - {beta:g}, all together with 1 - {number * beta:g}."]
     if made:
-        whole = (made + 1) * number * beta
-        said += [
-            f"{text.counted(made, 'other certificate')} made here: who picks one has confidence 1 - {whole:g} only."
-        ]
+        count = text.counted(made, "other certificate")
+        said += [f"Here {count} were made before: for whoever picks one, beta is {made + 1} times as large."]
     return said
 
 
