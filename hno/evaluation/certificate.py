@@ -27,7 +27,7 @@ SPLIT, LEVELS = "certify", "certify levels"
 """Random numbers of the tests, and of the starts that choose margin and levels: nothing else draws from them."""
 SUBSTEPS, POINTS = 4, 4
 """Runge-Kutta steps while a control is held, and states within each at which collisions are looked for."""
-SHARES = tuple(k / 20 for k in range(1, 21))
+SHARES = tuple(k / 50 for k in range(1, 51))
 """Shares of all starts that the candidates for a safe region have."""
 
 Solve = Callable[[Tensor, Tensor], Extremal]
@@ -254,8 +254,8 @@ def region(policy: Feedback, chosen: Trials, tests: Trials, plan: Plan) -> Regio
         The last region that passed; None where the first did not.
     """
     found = None
-    name, levels = promising(margins(policy, chosen), chosen.collided, plan)
-    margin = margins(policy, tests)[name]
+    name, levels = promising(margins(policy, chosen.x0, chosen.theta), chosen.collided, plan)
+    margin = margins(policy, tests.x0, tests.theta)[name]
     for level in levels:
         inside = margin >= level
         count, hits = int(inside.sum()), int((inside & tests.collided).sum())
@@ -297,34 +297,25 @@ def ranking(margin: Tensor, collided: Tensor) -> float:
     return float((above + ties / 2).double().mean() / len(free))
 
 
-def margins(policy: Feedback, tests: Trials) -> dict[str, Tensor]:
-    """Every margin of starts that the controller has, (N,)."""
-    game = policy.game
-    points = Points(torch.full_like(tests.theta[:, 0], game.horizon), tests.x0, tests.theta)
+def margins(policy: Feedback, x0: Tensor, theta: Tensor) -> dict[str, Tensor]:
+    """Every margin of starts (N, P, n) of types (N, P), by name, (N,); that of a value that is not finite is lowest."""
+    points = Points(torch.full_like(theta[:, 0], policy.game.horizon), x0, theta)
     field = in_batches(policy.operator.field, points)
-    found = {name: margin(game, points, field) for name, margin in MARGINS.items()}
-    return {name: margin for name, margin in found.items() if margin is not None and bool(margin.isfinite().all())}
+    least = torch.finfo(theta.dtype).min
+    return {name: margin(policy.game, points, field).nan_to_num(least) for name, margin in MARGINS.items()}
 
 
 def _value(game: Game, points: Points, field: Field | PotentialField) -> Tensor:
     return (field.players if isinstance(field, PotentialField) else field.value).sum(-1)
 
 
-def _lead(game: Game, points: Points, field: Field | PotentialField) -> Tensor | None:
-    if not isinstance(field, PotentialField) or field.branches.shape[-1] < 2:
-        return None
-    best, second = field.branches.topk(2).values.unbind(-1)
-    return best - second
-
-
 def _distance(game: Game, points: Points, field: Field | PotentialField) -> Tensor:
     return -game.constraint(points.x, points.theta).amax((-2, -1))
 
 
-MARGINS: Mapping[str, Callable[[Game, Points, Field | PotentialField], Tensor | None]] = {
+MARGINS: Mapping[str, Callable[[Game, Points, Field | PotentialField], Tensor]] = {
     "value": _value,
-    "lead": _lead,
     "distance": _distance,
 }
-"""What a start is worth without playing it: the sum of the learned values; by how much the best branch of a potential
-leads; what the start itself keeps from a collision. Higher is safer."""
+"""What a start is worth without playing it: the sum of the learned values, and how far the start itself is from a
+collision, which is minus the game's constraint there. Higher is safer."""

@@ -37,8 +37,8 @@ def _safe(found: SafeBound | None, game: Game, plan: Plan) -> list[str]:
     if found is None:
         return []
     keeps = f"{found.clearance:g} {game.constraint_unit}".strip()
-    counts = f"{found.collisions:,} of {plan.tests:,} tests are and collide"
-    known = f"{found.safe:,} of the first {found.solved:,} are, {found.unsolved:,} are unsolved"
+    counts = f"{found.collisions:,} of {plan.tests:,} tests start so and collide"
+    known = f"{found.safe:,} of the first {found.solved:,} start so, {found.unsolved:,} are unsolved"
     unknown = f"{found.unsolved_collisions:,} of the unsolved collide"
     return [
         f"at most {text.percent(found.bound)} over starts whose equilibrium keeps {keeps}: {counts}; {known}",
@@ -79,7 +79,7 @@ def assumptions(plan: Plan, game: Game, draws: Sequence[Sequence[Any]]) -> list[
     said = [
         f"starts uniform in the start box, {types}; independent, drawn by seed {plan.seed} for {SPLIT!r}",
         f"all {game.players} players play this controller in the game's own physics; {noise}, {delay}",
-        f"controls held for {plan.dt:g} s, {SUBSTEPS} Runge-Kutta steps each, looked at {POINTS} times for collisions",
+        f"controls held for {plan.dt:g} s, {SUBSTEPS} Runge-Kutta steps each, {POINTS} states of each seen for collisions",
         f"the tests did not choose the model: other seeds drew {others}",
     ]
     return said + ([f"the tests are independent of {unknown}, whose seeds nobody knows"] if unknown else [])
