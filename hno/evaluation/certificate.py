@@ -246,8 +246,8 @@ def conditional_bound(hits: Tensor, members: Tensor, first: int, beta: float) ->
 def region(policy: Feedback, chosen: Trials, tests: Trials, plan: Plan) -> Region | None:
     """The largest region of starts that is found to collide with a probability of at most the target.
 
-    Other starts, `chosen`, fix the margin, its levels and their order: from the level that promises most to ever larger
-    regions. The tests try them in this order until one fails, each with all of beta (a fixed sequence: the first level
+    Other starts, `chosen`, fix the margin, its levels and their order, from a small promising region to ever larger
+    ones. The tests try them in this order until one fails, each with all of beta (a fixed sequence: the first level
     that is too low passes with a probability of at most beta, and no later one is tried unless it does).
 
     Returns:
@@ -275,16 +275,18 @@ def promising(found: Mapping[str, Tensor], collided: Tensor, plan: Plan) -> tupl
 
 
 def _order(margin: Tensor, collided: Tensor, plan: Plan) -> tuple[float, list[float]]:
-    """The share of starts that levels promise, and the levels from the most promising one on."""
+    """The share of starts that levels promise, and the levels from the first one that is to be tried.
+
+    That is the smallest region that would pass with a collision more than it has here: the one that promises most is
+    often promising by chance.
+    """
     at = torch.tensor([1 - share for share in SHARES], dtype=torch.float64)
     levels = [*margin.double().quantile(at).tolist()[:-1], -math.inf]
-    bounds = [
-        upper_bound(int((inside & collided).sum()), int(inside.sum()), plan.beta)
-        for inside in (margin >= level for level in levels)
-    ]
-    start = bounds.index(min(bounds))
+    counts = [(int((inside & collided).sum()), int(inside.sum())) for inside in (margin >= one for one in levels)]
+    bounds, careful = ([upper_bound(hits + more, count, plan.beta) for hits, count in counts] for more in (0, 1))
+    sure = [place for place, bound in enumerate(careful) if bound <= plan.target]
     passing = [share for share, bound in zip(SHARES, bounds, strict=True) if bound <= plan.target]
-    return max(passing, default=0.0), levels[start:]
+    return max(passing, default=0.0), levels[sure[0] if sure else bounds.index(min(bounds)) :]
 
 
 def ranking(margin: Tensor, collided: Tensor) -> float:

@@ -51,7 +51,7 @@ def _region(found: Region | None, plan: Plan) -> str:
         return f"at most {text.percent(plan.target)} over no set of starts that was found"
     where = "all starts" if found.level is None else f"starts with {found.margin} >= {found.level:.6g}"
     share = f"{text.percent(found.share, 1)} of all; {found.collisions:,} of {found.tests:,} collide"
-    return f"at most {text.percent(found.target)} over {where}, {share}"
+    return f"at most {text.percent(found.target)} over the region of {where}, {share}"
 
 
 def _confidence(found: Certificate, made: int) -> list[str]:
@@ -79,7 +79,7 @@ def assumptions(plan: Plan, game: Game, draws: Sequence[Sequence[Any]]) -> list[
     said = [
         f"starts uniform in the start box, {types}; independent, drawn by seed {plan.seed} for {SPLIT!r}",
         f"all {game.players} players play this controller in the game's own physics; {noise}, {delay}",
-        f"controls held for {plan.dt:g} s, {SUBSTEPS} Runge-Kutta steps each, {POINTS} states of each seen for collisions",
+        f"controls held for {plan.dt:g} s, {SUBSTEPS} Runge-Kutta steps each, {POINTS} states of each are looked at",
         f"the tests did not choose the model: other seeds drew {others}",
     ]
     return said + ([f"the tests are independent of {unknown}, whose seeds nobody knows"] if unknown else [])
