@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from hno import games
-    from hno.cli.calls import evaluate, train
+    from hno.cli.calls import certify, evaluate, train
     from hno.control.belief import Believing
     from hno.control.exported import load_exported
     from hno.control.rollout import rollout
@@ -23,6 +23,7 @@ __version__ = "0.1.0"
 __all__ = [
     "Believing",
     "__version__",
+    "certify",
     "check_game",
     "evaluate",
     "fit",
@@ -36,6 +37,7 @@ __all__ = [
 
 _PLACES = {
     "Believing": "hno.control.belief:Believing",
+    "certify": "hno.cli.calls:certify",
     "check_game": "hno.games.testing:check_game",
     "evaluate": "hno.cli.calls:evaluate",
     "fit": "hno.training.fit:fit",

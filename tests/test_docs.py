@@ -139,7 +139,7 @@ def commands() -> list[str]:
         if block.language in ("", "sh")
         for line in block.text.splitlines()
     )
-    known = [line for line in found if re.match(r"hno (train|evaluate|labels|report)\b", line)]
+    known = [line for line in found if re.match(r"hno (train|evaluate|labels|report|certify)\b", line)]
     return [" ".join(map(shlex.quote, shlex.split(line, comments=True))) for line in known if not OWN.search(line)]
 
 
@@ -147,7 +147,7 @@ def commands() -> list[str]:
 def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A narrow-road operator with random weights, as training would have saved it."""
     game, path = make("narrow_road"), tmp_path_factory.mktemp("run") / "best.ckpt"
-    kept = record(game, Architecture(), Provenance(types=[(1.0, 1.0)]))
+    kept = record(game, Architecture(), Provenance(types=[(1.0, 1.0)], draws=[]))
     weights = {f"operator.{name}": weight for name, weight in make_operator(game).state_dict().items()}
     path.write_bytes(seal({"state_dict": weights, **kept}))
     return path

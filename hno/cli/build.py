@@ -16,6 +16,7 @@ from hno.cli.resume import check_same_training, newest, own_configuration, run_f
 from hno.cli.settings import TrainSettings
 from hno.data import Collocation, GameData, LabelPlan, make_sampler
 from hno.data.curriculum import Curriculum
+from hno.data.exchange import drawn_by
 from hno.data.labels import Report, default_cache
 from hno.evaluation.ntk import check_rows
 from hno.games import Game, make
@@ -23,7 +24,7 @@ from hno.games.grid import parse_types
 from hno.losses import Objective, make_objective
 from hno.operators import Architecture, Choice, ValueOperator, make_operator
 from hno.training.adaptive import Adaptive
-from hno.training.checkpoint import Provenance, check_resumable, record
+from hno.training.checkpoint import Draw, Provenance, check_resumable, record
 from hno.training.fit import Settings, make_trainer
 from hno.training.optimizers import make_optimizer
 from hno.training.quiet import quiet_lightning
@@ -94,8 +95,26 @@ def build(settings: TrainSettings, report: Report | None = None) -> Built:
 
 def record_of(settings: TrainSettings, built: Built) -> dict[str, Any]:
     """What its checkpoints say of a training."""
-    origin = Provenance(settings.operator.name, built.data.type_list, settings.seed, training_hash(settings))
-    return record(built.data.game, built.architecture, origin)
+    made_by = settings.seed, training_hash(settings), draws(settings, built.data)
+    return record(
+        built.data.game, built.architecture, Provenance(settings.operator.name, built.data.type_list, *made_by)
+    )
+
+
+def draws(settings: TrainSettings, data: GameData) -> list[Draw]:
+    """Every draw of random states that a training reads, validates on or is stopped by."""
+    choice, labelled = settings.validation, data.needs_labels
+    found: list[Draw] = [("batches", "batches", data.seed)]
+    if labelled:
+        found += [("labels and held-out labels", "train", data.seed)]
+        found += [(f"labels of {path.name}", *drawn_by(path)) for path in data.labels.files]
+    if settings.data.adaptive.rounds:
+        found += [("added labels", "adaptive", data.seed)]
+    if choice.types is not None:
+        found += [("validation and stopping", "validation", choice.seed)]
+    elif labelled:
+        found += [("validation and stopping", "train", data.seed)]
+    return found
 
 
 def _labels(settings: TrainSettings, game: Game) -> LabelPlan:

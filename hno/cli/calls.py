@@ -1,4 +1,4 @@
-"""The commands as Python calls: `hno.train` and `hno.evaluate`."""
+"""The commands as Python calls: `hno.train`, `hno.evaluate` and `hno.certify`."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from hno.cli import certify as certification
 from hno.cli import evaluate as evaluation
 from hno.cli.arguments import Arguments, quoted
 from hno.cli.build import check
@@ -83,6 +84,25 @@ def evaluate(
             with recorded(results):
                 evaluation.evaluate(checked, results)
     return results.content
+
+
+@interruptible_call()
+def certify(checkpoint: str | Path, settings: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Bound the probability of collision of a controller, as `hno certify` does; `certificate.json` lies beside it.
+
+    Args:
+        checkpoint: a checkpoint, the folder of a run, or an exported controller.
+        settings: keys of `hno certify --help` and their values, such as {"tests": 10_000, "beta": 1e-6}.
+
+    Returns:
+        The content of certificate.json: `every`, `safe` and `region` as in `hno.evaluation.certificate`, and `text`.
+
+    Raises:
+        ValueError, LookupError: settings that are unknown or make no sense, or the tests chose the model.
+        CheckpointError: a checkpoint that cannot be read.
+    """
+    chosen = _overrides("certify", {"checkpoint": str(checkpoint), **(settings or {})})
+    return certification.write(certification.check(compose("certify", for_hydra("certify", Arguments([], chosen, {})))))
 
 
 def train_settings(overrides: Sequence[str]) -> TrainSettings:

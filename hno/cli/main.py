@@ -46,6 +46,12 @@ COMMANDS = {
         "Evaluate checkpoints. How often they collide, where they err, and how they compare on the same starts.",
         "evaluate", "checkpoint", FOLDERS, JOBS,
     ),
+    "certify": Command(
+        "hno.cli.certify:run", "RUN|CHECKPOINT|EXPORTED [key=value ...]",
+        "Bound the probability of collision. By independent tests, with a stated confidence; refused where they chose "
+        "the model.",
+        "certify", "checkpoint", flags=("--dry-run", "--config-dir"),
+    ),
     "labels": Command(
         "hno.cli.labels:run", "game=NAME theta=TYPES n=STARTS [key=value ...]",
         "Solve open-loop equilibria and keep them with their certificates. What was stopped goes on where it was.",

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field
 
 from hno.cli import schema
-from hno.cli.schema import Amount, Count, Loose, Place, Positive, Seed, Settings, Share, Size, Text
+from hno.cli.schema import Amount, Count, Loose, Place, Positive, Probability, Seed, Settings, Share, Size, Text
 
 
 class GameSettings(Settings):
@@ -197,10 +197,30 @@ class ReportSettings(Settings):
     watch: Annotated[float, Field(ge=1)] | None
 
 
+class CertifySettings(Settings):
+    """`hno certify`."""
+
+    checkpoint: Place
+    expected_game: Text | None
+    tests: Size
+    beta: Probability
+    seed: Seed
+    theta: Loose
+    clearance: Amount
+    dt: Positive
+    equilibria: Count | None
+    target: Probability
+    noise: Amount
+    delay: Count
+    workers: Size | None
+    threads: Size | None
+
+
 COMMANDS: dict[str, type[Settings]] = {
     "train": TrainSettings,
     "evaluate": EvaluateSettings,
     "labels": LabelSettings,
     "report": ReportSettings,
+    "certify": CertifySettings,
 }
 """By the name of the root configuration."""

@@ -158,5 +158,17 @@ def read_own(path: Path, game: Game) -> Extremal:
     return labels
 
 
+def drawn_by(path: Path) -> tuple[str, int | None]:
+    """Split and seed of the start states of a label file; its source and None where the label cache did not write it.
+
+    Raises as `hno.data.store.read_labels`.
+    """
+    provenance = read_labels(path)[1]
+    request = provenance.get("request")
+    if isinstance(request, Mapping) and isinstance(request.get("seed"), int):
+        return str(request.get("split")), int(request["seed"])
+    return str(provenance.get("source", "unknown"))[:80], None
+
+
 def _identity(game: Game) -> dict[str, str]:
     return {"game": type(game).__name__, "fingerprint": game.fingerprint()}

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
-from scipy.special import betaincinv
+from scipy.special import betainccinv, betaincinv
 from torch import Tensor
 
 from hno.games import Box
@@ -51,9 +51,15 @@ def credible(belief: Tensor, share: float = 0.9) -> Tensor:
 
 def clopper_pearson(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float] | None:
     """Exact interval of a binomial rate; None without trials."""
-    if trials == 0:
-        return None
-    tail, failures = (1 - confidence) / 2, trials - successes
-    low = betaincinv(successes, failures + 1, tail) if successes else 0.0
-    high = betaincinv(successes + 1, failures, 1 - tail) if failures else 1.0
-    return float(low), float(high)
+    tail = (1 - confidence) / 2
+    return (lower_bound(successes, trials, tail), upper_bound(successes, trials, tail)) if trials else None
+
+
+def upper_bound(successes: int, trials: int, beta: float) -> float:
+    """What a rate exceeds with a probability of at most `beta` (Clopper and Pearson 1934); 1 without trials."""
+    return float(betainccinv(successes + 1, trials - successes, beta)) if successes < trials else 1.0
+
+
+def lower_bound(successes: int, trials: int, beta: float) -> float:
+    """What a rate is below with a probability of at most `beta`; 0 without trials."""
+    return float(betaincinv(successes, trials - successes + 1, beta)) if successes else 0.0

@@ -12,7 +12,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import joblib
 import lightning as L
 import torch
 from torch import Tensor
@@ -22,19 +21,17 @@ from hno.control.policy import Feedback
 from hno.control.rollout import rollout
 from hno.data import GameData
 from hno.data.datamodule import mix
+from hno.data.many import solve_many
 from hno.games import Game
 from hno.pontryagin.online import subgame
-from hno.pontryagin.solve import Solver, solve
-from hno.pontryagin.threads import cores, label_pool
+from hno.pontryagin.solve import Solver
 from hno.training.module import TrainingModule
-from hno.types import Extremal, Status, best_of, join, part
+from hno.types import Extremal, Status, best_of, part
 
 log = logging.getLogger(__name__)
 
 ROUND = 7
 """Tells the random numbers of rounds from those of batches."""
-CHUNK = 64
-"""Start states that one process solves at a time."""
 
 
 @dataclass(frozen=True)
@@ -176,12 +173,8 @@ class AdaptiveLabels(L.Callback):
         return result
 
     def _solved(self, data: GameData, group: Candidates, rows: Tensor) -> Extremal:
-        game, x0, theta = subgame(data.game, group.tau), group.x[rows].double(), group.theta[rows].double()
-        jobs = list(zip(x0.split(CHUNK), theta.split(CHUNK), strict=True))
-        workers = min(self.workers or cores(), len(jobs))
-        pool = label_pool(workers)
-        call = joblib.delayed(solve)
-        return join(pool(call(game, *job, self.solver, all_equilibria=data.potential) for job in jobs))
+        game, x0, theta = subgame(data.game, group.tau), group.x[rows], group.theta[rows]
+        return solve_many(game, x0, theta, self.solver, self.workers, all_equilibria=data.potential)
 
     def state_dict(self) -> dict[str, Any]:
         """Rounds so far."""

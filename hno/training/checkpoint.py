@@ -30,8 +30,12 @@ log = logging.getLogger(__name__)
 
 KEY = "hno"
 """Checkpoint entry that says how to build the operator and where it comes from."""
-FORMAT = 6
+FORMAT = 7
 """Version of that entry."""
+
+
+Draw = tuple[str, str, int | None]
+"""What random states were for, their split, and their seed; None where it is unknown, as of labels brought along."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +46,8 @@ class Provenance:
     types: Sequence[tuple[float, ...]] = ()
     seed: int | None = None
     training_hash: str = ""
+    draws: Sequence[Draw] | None = None
+    """Every draw of random states that made the operator; None where nobody has listed them."""
 
 
 def record(game: Game, architecture: Architecture, provenance: Provenance) -> dict[str, Any]:
@@ -367,8 +373,10 @@ class LearnedPolicy(Feedback):
         return {"game": game, "operator": self.provenance.method, **chosen}
 
     def origin(self) -> dict[str, Any]:
-        """Names of its parts, training types and seed."""
-        return {"names": self.names(), "types": [list(theta) for theta in self.types], "seed": self.provenance.seed}
+        """Names of its parts, training types, seed, and what was drawn for its training."""
+        types, draws = [list(theta) for theta in self.types], self.provenance.draws
+        drawn = None if draws is None else [list(draw) for draw in draws]
+        return {"names": self.names(), "types": types, "seed": self.provenance.seed, "draws": drawn}
 
 
 def load_policy(path: str | Path, game: str | None = None, threads: int = 1) -> LearnedPolicy:

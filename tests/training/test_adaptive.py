@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from hno.control import Feedback
-from hno.data import Collocation, GameData, LabelPlan, make_sampler
+from hno.data import Collocation, GameData, LabelPlan, make_sampler, many
 from hno.games import Game, make
 from hno.losses import make_objective
 from hno.operators import ValueOperator
@@ -46,7 +46,7 @@ class Solved:
 @pytest.fixture
 def solved(monkeypatch: pytest.MonkeyPatch) -> Solved:
     solver = Solved()
-    monkeypatch.setattr(module, "solve", solver)
+    monkeypatch.setattr(many, "solve", solver)
     return solver
 
 
@@ -109,7 +109,7 @@ def test_labels_that_collide_are_counted_and_not_trained_on(monkeypatch: pytest.
     def colliding(game: Game, x0: Tensor, theta: Tensor, *arguments: Any, **options: Any) -> Extremal:
         return fake_solve(game, x0, theta, **options)._replace(clearance=torch.full((len(x0),), -0.1).double())
 
-    monkeypatch.setattr(module, "solve", colliding)
+    monkeypatch.setattr(many, "solve", colliding)
     labelled = data(True)
     labelled.setup("fit")
     policy = Feedback(potential_operator("narrow_road").float(), checked=False)

@@ -213,7 +213,7 @@ def test_another_format_is_one_clear_sentence(save: Save, version: int | None) -
     """Format 2 is what the releases before wrote: an operator's own name, options and types."""
     older = {"format": version, "game": "narrow_road", "operator": "hno", "options": {"width": 64}, "seen_types": []}
     path = save(hno=older)
-    assert refused(path) == f"{path} has format {version}, this version of hno reads format 6: train it again."
+    assert refused(path) == f"{path} has format {version}, this version of hno reads format 7: train it again."
     assert "train it again" in refused(save(spec={"format": version}))
 
 
