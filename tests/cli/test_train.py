@@ -3,6 +3,7 @@ from __future__ import annotations
 import csv
 import itertools
 import json
+import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,6 +24,7 @@ from hno.games import Game
 from hno.operators.deeponet import DeepONet
 from hno.training import validation
 from hno.training.divergence import StopOnDivergence
+from hno.training.module import TrainingModule
 from hno.training.validation import Score, Starts
 from hno.types import Extremal, Trajectory
 from tests.cli.conftest import SMOKE, Command, Outcome
@@ -109,7 +111,11 @@ def test_results_hold_every_part_of_the_run(command: Command) -> None:
     assert (run.folder / results["checkpoint"]).is_file()
 
 
-def test_run_says_what_happened(command: Command) -> None:
+def test_run_says_what_happened(command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    def warning(self: TrainingModule) -> None:
+        logging.getLogger("lightning.pytorch.trainer").warning("a rank is gone")
+
+    monkeypatch.setattr(TrainingModule, "on_train_start", warning, raising=False)
     run = command("train", *SMOKE, "trainer.max_steps=4", "trainer.print_every=2")
     assert "step 2 of 4" in run.text
     assert "narrow_road / hno / potential / sin" in run.text
@@ -117,6 +123,7 @@ def test_run_says_what_happened(command: Command) -> None:
     log = (run.folder / "train.log").read_text()
     assert "step 4 of 4" in log
     assert "GPU available" not in run.text + log, "Lightning speaks of what goes wrong only"
+    assert "[lightning.pytorch.trainer][WARNING] - a rank is gone" in log
 
 
 @pytest.mark.parametrize(("steps", "every"), [(1, 5), (5, 2), (4, 2)])
