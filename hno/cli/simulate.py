@@ -222,9 +222,10 @@ def choose(paths: Sequence[str], settings: SimulateSettings) -> Chosen:
             games = f"{opened[0].about['game']!r} and {other.about['game']!r}"
             raise UsageError(f"{paths[0]} and {path} are of different games, or of other constants: {games}.")
     middle = ((game.type_box.lo + game.type_box.hi) / 2).tolist()
+    types: Any = settings.theta.split(",") if settings.theta else middle
     try:
         control_steps(game, settings.dt)
-        (theta,) = game.validate_types([settings.theta.split(",") if settings.theta else middle])
+        (theta,) = game.validate_types([types])
     except ValueError as error:
         raise UsageError(str(error)) from error
     return Chosen(opened * (game.players // len(opened)), theta, settings.seed, settings.dt)

@@ -21,8 +21,8 @@ HOST = "127.0.0.1"
 LARGEST = 4096
 """Bytes that a page may send."""
 POLICY = (
-    "default-src 'none'; script-src 'nonce-{nonce}'; style-src 'nonce-{nonce}'; connect-src 'self'; img-src data:; base-uri 'none'; "
-    "form-action 'none'; frame-ancestors 'none'"
+    "default-src 'none'; script-src 'nonce-{nonce}'; style-src 'nonce-{nonce}'; connect-src 'self'; img-src data:; "
+    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
 Speed = Annotated[float, Field(ge=0.05, le=10)]
 """The game's seconds in one of the clock."""
@@ -62,7 +62,7 @@ class Window:
 
     def __init__(self, port: int, about: Mapping[str, Any], player: int = 0, speed: float = 0.5) -> None:
         self.about, self.token = about, secrets.token_urlsafe(16)
-        self.asked = Asked(player=player, speed=speed)
+        self.asked = Asked(player=player, drive=[], speed=speed)
         self.events: list[Event] = []
         self._changed, self._pages, self._due = threading.Condition(), 0, 0.0
         try:
@@ -205,7 +205,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.end_headers()
 
     def _refused(self) -> bool:
-        """Whether a request is not of this page: without the token, of another site, by another name of this machine."""
+        """Whether a request is not of this page: without the token, of another site, or of another host."""
         port = self.window.server.server_port
         hosts = [f"{name}:{port}" for name in (HOST, "localhost")]
         token = parse_qs(urlsplit(self.path).query).get("token", [""])[0]
