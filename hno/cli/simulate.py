@@ -248,4 +248,7 @@ def play(chosen: Chosen, window: Window) -> None:
 def about(game: Game, paths: Sequence[str]) -> dict[str, Any]:
     """What the page knows of all episodes."""
     box = torch.stack([end.expand(game.players, -1) for end in (game.control_box.lo, game.control_box.hi)])
-    return {"players": game.players, "horizon": game.horizon, "controls": plain(box), "artefacts": list(paths)}
+    return {
+        "players": game.players, "horizon": game.horizon, "controls": plain(box), "artefacts": list(paths),
+        "discs": game.distance_constraints,
+    }  # fmt: skip

@@ -204,6 +204,22 @@ def test_a_person_drives_one_player_until_the_page_is_closed(one) -> None:
             time.sleep(0.05)
 
 
+def test_controls_that_are_not_finite_end_the_episode(playing: Playing) -> None:
+    policy = playing.chosen.policies[0]
+    sound = policy.answers
+
+    def answers(at):
+        found = sound(at)
+        return found if float(at.tau) > 2.0 else {**found, "control": found["control"] * torch.nan}
+
+    policy.answers = answers
+    *_, frame, last = episode(playing.events())
+    assert frame["t"] == pytest.approx(1.0)
+    assert frame["controls"] == [[None, None]] * 2
+    assert "no controller has a finite answer" in last["end"]
+    assert last["bad"]
+
+
 BAD = [
     {"drive": [2, 0]},
     {"drive": [0]},

@@ -12,6 +12,7 @@ import pytest
 import torch
 
 import hno
+from hno.pontryagin.integrate import runge_kutta
 from tests.examples.conftest import FOLDER
 
 SOURCE = FOLDER / "realtime" / "loop.c"
@@ -52,6 +53,21 @@ def test_the_loop_drives_as_a_rollout_does(program: Path, exported: Callable[[st
     assert float(said[1]) == pytest.approx(float(played.distance), abs=5e-2)  # a rollout looks between steps too
     assert float(said[2]) == pytest.approx(float(policy.game.collision_radius(torch.tensor([THETA]))[0, 0, 0]))
     assert int(said[3]) == int(played.collided)
+
+
+def test_cars_drive_on_with_what_they_have_where_deadlines_are_missed(program: Path, tmp_path: Path) -> None:
+    """In real time, whatever the machine makes of it: no period is left out, and none has controls from nowhere."""
+    trace = tmp_path / "trace.txt"
+    ended = run(program, "rate=2000", f"trace={trace}")
+    missed = re.search(r"missed deadlines: (\d+) ", ended.stdout)
+    assert missed is not None
+    rows = torch.from_numpy(np.loadtxt(trace))
+    x, u = rows[:, 1:9].unflatten(1, (2, 4)), rows[:, 9:].unflatten(1, (2, 2))
+    assert len(rows) == 6000
+    after = runge_kutta(hno.games.make("narrow_road").double(), x[:-1], u[:-1], 1 / 2000)
+    torch.testing.assert_close(x[1:], after, atol=1e-6, rtol=0)
+    held = (u[1:] == u[:-1]).all(-1).all(-1)
+    assert int(held.sum()) + bool((u[0] == 0).all()) >= int(missed[1])
 
 
 def test_the_game_that_the_loop_knows_is_the_narrow_road() -> None:
