@@ -13,6 +13,7 @@ FLAGS = {
     "--to": "PATH: where results go; of an export, the kind of controller",
     "--multirun": "(or -m) run every combination of values that are separated by commas; anywhere on the line",
     "--config-dir": "FOLDER: choices of your own, such as FOLDER/experiment/mine.yaml",
+    "--no-window": "play one episode without a page, and print how it ends",
     "--help": "this text",
     "--version": "hno's version",
     "--shell-completion": "install=SHELL, for its eval: completion of keys and choices",

@@ -33,7 +33,7 @@ class Command(NamedTuple):
     """Flags besides --help and --version."""
 
 
-JOBS = tuple(name for name in FLAGS if name not in ("--help", "--version"))
+JOBS = tuple(name for name in FLAGS if name not in ("--help", "--version", "--no-window"))
 FOLDERS = ("hydra.run.dir", "hydra.sweep.dir")
 COMMANDS = {
     "train": Command(
@@ -66,6 +66,12 @@ COMMANDS = {
         "hno.cli.export:run", "RUN|CHECKPOINT --to numpy|c|onnx|torch [folder=FOLDER]",
         "Write a controller that runs without this package. It is compared with the checkpoint before it is written.",
         flags=("--to",),
+    ),
+    "simulate": Command(
+        "hno.cli.simulate:run", "ARTEFACT [ARTEFACT2] [theta=2,4] [drive=1] [seed=0] [speed=0.5] [port=0]",
+        "Let exported controllers play in a browser window, or drive one player yourself. The arrow keys (and W, S) "
+        "are its controls.",
+        flags=("--no-window",),
     ),
     "list": Command(
         "hno.cli.listing:run", "[KIND ...]",

@@ -54,7 +54,8 @@ def c_files(program: Program, game: Game, about: str) -> dict[str, str]:
     margin = ROUNDING * game.horizon
     costate = one["costate"].shape
     words = {
-        "ABOUT": about, "IDENTITY": hex(zlib.crc32(text.encode())), "HORIZON": literal(game.horizon, "real"),
+        "ABOUT": about, "IDENTITY": hex(zlib.crc32(text.encode())), "FINGERPRINT": game.fingerprint(),
+        "HORIZON": literal(game.horizon, "real"),
         "PLAYERS": costate[2], "STATES": costate[3], "FUNCTIONS": costate[1], "CONTROLS": one["control"].shape[2],
         "PREPARED": _fields({name: node for node, name in fields.items()}), "ANSWER": _fields(one),
         "HELPERS": "\n".join(code for name, code in HELPERS.items() if f"{name}(" in text),

@@ -17,8 +17,9 @@ from hno.training import Fitted, Settings, fit
 from hno.training.module import TrainingModule
 from hno.training.optimizers import optimizers
 from tests.cli.conftest import clean_globals, command, no_pages
+from tests.export.conftest import exported
 
-__all__ = ["clean_globals", "command", "no_pages"]
+__all__ = ["clean_globals", "command", "exported", "no_pages"]
 
 FOLDER = Path(__file__).parents[2] / "examples"
 LABELS = {"value": {}, "costate": {}}

@@ -8,6 +8,7 @@
 #define HNO_FUNCTIONS @FUNCTIONS@ /* value functions: one for each player, or one potential of all */
 #define HNO_HORIZON @HORIZON@ /* s */
 #define HNO_IDENTITY @IDENTITY@u /* of this controller */
+#define HNO_FINGERPRINT "@FINGERPRINT@" /* of the game and its constants, as in manifest.json */
 
 /* Return codes. Below 0 nothing was written; otherwise bits that warn. */
 #define HNO_OK 0
