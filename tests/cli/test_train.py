@@ -54,7 +54,12 @@ def losses(folder: Path) -> list[dict[str, str]]:
 @pytest.mark.parametrize(
     ("game", "operator", "activation", "function"),
     [
-        *((*parts, "potential") for parts in itertools.product(GAMES, OPERATORS, ACTIVATIONS)),
+        *(
+            pytest.param(
+                *parts, "potential", marks=() if "narrow_road" in parts or "sin" in parts else pytest.mark.slow
+            )
+            for parts in itertools.product(GAMES, OPERATORS, ACTIVATIONS)
+        ),
         *((game, "hno", "sin", "value") for game in GAMES),
     ],
 )

@@ -18,7 +18,11 @@ FINE = Solver(extra_nodes=300)
 """Errors fall with the fourth power of the mesh width: this is fine enough for 1e-8."""
 
 
-@pytest.mark.parametrize(("settings", "tolerance"), [(Solver(), 1e-7), (FINE, 1e-8)], ids=["default", "fine"])
+@pytest.mark.parametrize(
+    ("settings", "tolerance"),
+    [(Solver(), 1e-7), pytest.param(FINE, 1e-8, marks=pytest.mark.slow)],
+    ids=["default", "fine"],
+)
 @pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize("players", [2, 3])
 def test_general_sum_equilibrium_is_the_exact_one(players, seed, settings, tolerance):
