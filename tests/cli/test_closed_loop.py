@@ -264,7 +264,10 @@ ALL_ELSE = (
 )  # fmt: skip
 
 
-@pytest.mark.parametrize("recipe", [ROLLOUT, ALL_ELSE], ids=["rollout states", "all else"])
+@pytest.mark.parametrize(
+    "recipe",
+    [pytest.param(ROLLOUT, id="rollout states"), pytest.param(ALL_ELSE, id="all else", marks=pytest.mark.slow)],
+)
 def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(
     command: Command, tmp_path: Path, recipe: tuple[str, ...]
 ) -> None:

@@ -105,4 +105,4 @@ def test_the_assets_lie_inside_the_package():
     assert spec is not None
     assert spec.origin is not None
     assets = Path(spec.origin).parent / "assets"
-    assert {path.suffix for path in assets.iterdir()} == {".j2", ".css", ".js"}
+    assert {path.suffix for path in assets.iterdir()} == {".j2", ".css", ".js", ".html"}

@@ -169,7 +169,7 @@ def power_cut(error: BaseException) -> Iterator[None]:
         yield
 
 
-@pytest.mark.parametrize("optimizer", ["soap", "adam"])
+@pytest.mark.parametrize("optimizer", ["soap", pytest.param("adam", marks=pytest.mark.slow)])
 def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(
     command: Command, tmp_path: Path, optimizer: str
 ) -> None:

@@ -33,7 +33,7 @@ def motion(steps: int = 4) -> list[tuple[float, np.ndarray, np.ndarray]]:
     return [(2.5 - 0.1 * k, state(), generator.normal(0, 0.4, (2, 2))) for k in range(steps)]
 
 
-@pytest.mark.parametrize("acts", ["mean", "mode"])
+@pytest.mark.parametrize("acts", ["mean", pytest.param("mode", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kind", KINDS)
 def test_it_is_the_policy_with_beliefs_for_one_player(exported: Exported, kind: str, acts: str) -> None:
     folder, theta = exported(CASE, kind), torch.tensor([[2.0, 4.5]])

@@ -72,7 +72,8 @@ def test_a_killed_run_ends_like_an_uninterrupted_one(whole: Path, tmp_path: Path
     assert (folder / ".hydra" / "config.yaml").read_bytes() == before
 
 
-@pytest.mark.parametrize("hook", ["on_train_batch_start", pytest.param("on_validation_start", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("hook", ["on_train_batch_start", "on_validation_start"])
 def test_a_run_that_a_signal_ended_ends_like_an_uninterrupted_one(whole: Path, tmp_path: Path, hook: str) -> None:
     step = 2 * EVERY if "validation" in hook else 49  # the next one has a row
     folder, moment = tmp_path / "run", Moment(step, hook, signal=signal.SIGUSR1)
