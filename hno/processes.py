@@ -174,7 +174,13 @@ def follow(parent: int) -> None:
     """
     if os.getppid() == parent and not _State.follows:
         _State.follows = True
-        _watch(parent, lambda: os.kill(os.getpid(), signal.SIGTERM))
+
+        def orphaned() -> None:
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(2 * GRACE)
+            os._exit(1)  # workers of a pool would wait for more to do
+
+        _watch(parent, orphaned)
 
 
 def _watch(parent: int, orphaned: Callable[[], None]) -> None:

@@ -75,13 +75,13 @@ class Started(NamedTuple):
             assert self.process.poll() is None, self.output.read_text()
             time.sleep(0.02)
 
-    def end(self, number: int) -> Left:
-        """Send a signal and wait for the end."""
+    def end(self, number: int, patience: float = 3.0) -> Left:
+        """Send a signal and wait for the end, and for that of its processes for some seconds more."""
         began = time.monotonic()
         self.process.send_signal(number)
         self.process.wait(60)
         seconds = time.monotonic() - began
-        deadline = time.monotonic() + 3.0
+        deadline = time.monotonic() + patience
         while (left := alive(self.name)) and time.monotonic() < deadline:
             time.sleep(0.1)
         return Left(self.process.returncode, self.output.read_text(), seconds, left)

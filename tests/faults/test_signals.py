@@ -255,6 +255,6 @@ def after_in_a_sweep(name: str, launcher: str, tmp_path: Path, cache: Path) -> t
     words = (*TRAIN, *steps, "data.workers=1", "seed=0,1", *LAUNCHERS[launcher], "--to", str(runs))
     with started("sweep", tmp_path, cache, *words, "-m") as command:
         command.until(lambda: sum("step 5 of" in log.read_text() for log in runs.rglob("train.log")) == many)
-        left = command.end(getattr(signal, name))
+        left = command.end(getattr(signal, name), 20.0 if name == "SIGKILL" else 3.0)
     found = [json.loads(path.read_text()) for path in runs.rglob("results.json")]
     return left, [(results["status"], results["reason"]) for results in found]
