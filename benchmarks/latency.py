@@ -28,7 +28,7 @@ from hno.control import Feedback
 from hno.export.trace import points
 from hno.games import make
 from hno.operators import Architecture, Choice, make_operator
-from hno.runtime import Believer, Learning, load
+from hno.runtime import Believer, load
 from hno.training.checkpoint import load_policy
 
 BATCHES = 1, 64, 4096
@@ -166,7 +166,7 @@ def _believing(folder: Path, policy: Feedback) -> Callable[[], object]:
     box = policy.game.type_box
     types = np.tile(theta, (TYPES, 1))
     types[:, 1] = np.linspace(float(box.lo[1]), float(box.hi[1]), TYPES)
-    player, seen = Believer(load(folder), 0, types, learning=Learning(floor=1e-5)), policy.act(tau, x, theta)
+    player, seen = Believer(load(folder), 0, types), policy.act(tau, x, theta)
     return lambda: (player.act(float(tau), x), player.observe(seen, 0.002))
 
 

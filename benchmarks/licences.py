@@ -22,7 +22,7 @@ def main() -> None:
     """Print a line for each package."""
     found = {str(each.metadata["Name"]): each for each in distributions()}
     for name, each in sorted(found.items(), key=lambda entry: entry[0].lower()):
-        print(f"{name:32} {each.version:20} {licence(each.metadata)}")  # type: ignore[arg-type]
+        print(f"{name:32} {each.version:20} {licence(each.metadata)}")  # type: ignore[arg-type]  # it is a Message
 
 
 if __name__ == "__main__":

@@ -100,6 +100,7 @@ def certify(checkpoint: str | Path, settings: Mapping[str, Any] | None = None) -
     Raises:
         ValueError, LookupError: settings that are unknown or make no sense, or the tests chose the model.
         CheckpointError: a checkpoint that cannot be read.
+        KeyboardInterrupt, SystemExit: a signal ended it.
     """
     chosen = _overrides("certify", {"checkpoint": str(checkpoint), **(settings or {})})
     return certification.write(certification.check(compose("certify", for_hydra("certify", Arguments([], chosen, {})))))

@@ -24,6 +24,7 @@ from hno.evaluation.certificate import Certificate, Plan, certify
 from hno.evaluation.statement import describe
 from hno.games import Game
 from hno.games.grid import parse_types
+from hno.report.runs import RESULTS, read_json
 from hno.runtime.artefact import MANIFEST
 
 CERTIFICATE = "certificate.json"
@@ -72,7 +73,7 @@ def draws_of(policy: Model, folder: Path) -> list[list[Any]]:
     """Every draw of random states that made the model, and that of the evaluation whose results lie beside it.
 
     Raises:
-        ValueError: the model does not say.
+        ValueError: the model does not say, or the results cannot be read.
     """
     draws = policy.origin().get("draws")
     if draws is None:
@@ -80,8 +81,8 @@ def draws_of(policy: Model, folder: Path) -> list[list[Any]]:
             "The checkpoint does not list the starts that it was trained, validated and stopped by, so nobody can say "
             "that other ones test it: train it with `hno train`, or list them in Provenance(draws=...)."
         )
-    path = folder / "results.json"
-    tested = json.loads(path.read_text()).get("test_seed") if path.exists() else None
+    path = folder / RESULTS
+    tested = read_json(path).get("test_seed") if path.exists() else None
     return [*draws, *([["evaluation", "test", tested]] if isinstance(tested, int) else [])]
 
 

@@ -196,11 +196,8 @@ def play_starts(evaluation: Evaluation, results: Results) -> tuple[Evaluation, T
     results.time("evaluation", time.perf_counter() - solved)
     if results.content["episodes"] is None:
         write_json(folder / EPISODES, together(game, kept))
-        conditions = {
-            name: found.options[name]
-            for name in ("clearance", "dt", "widen", "noise", "delay", "learns")
-            if name in found.options
-        }
+        conditions = {name: found.options[name] for name in ("clearance", "dt", "widen", "noise", "delay")}
+        conditions["learns"] = found.options.get("learns")  # what no run has while it trains
         results.update(**conditions, test_seed=disturbance.seed, constraint_unit=game.constraint_unit)
         results.update(table=table, episodes=EPISODES)
         draw_typical(kept, folder / "rollout.png", title(results.content))

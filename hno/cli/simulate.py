@@ -47,7 +47,7 @@ class SimulateSettings(Settings):
     """Time that a control is held, s."""
 
 
-class Lost(Exception):  # noqa: N818
+class Lost(Exception):  # noqa: N818  # no error of the program
     """An episode cannot go on."""
 
 
@@ -197,7 +197,7 @@ def read(given: Arguments) -> tuple[list[str], SimulateSettings]:
         UsageError: a key is unknown, a value makes no sense, or there is no artefact.
     """
     paths = [*given.words, *(entry for entry in given.overrides if Path(entry).exists())]
-    words = dict(entry.split("=", 1) for entry in given.overrides if entry not in paths and "=" in entry)
+    words = dict(entry.partition("=")[::2] for entry in given.overrides if entry not in paths)
     if not paths:
         raise UsageError("Name one exported controller, or one for each player; `hno export` writes them.")
     try:

@@ -111,7 +111,7 @@ class Believing(Policy):
         """Candidates of every player, (P, C)."""
         self.candidates = _combinations(self.grid)
         """What the types of all may be, as player i sees it, (P, K, P); its own place is empty (0)."""
-        self.learning.check(self.candidates.shape[1])
+        self.learning.check()
 
     def reset(self, x0: Tensor, theta: Tensor) -> None:
         """All believe the prior again."""

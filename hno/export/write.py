@@ -29,8 +29,8 @@ from hno.types import ROUNDING
 
 TOLERANCE = 1e-5
 """Largest error that an artefact may have, relative to the largest entry of the output."""
-SILENT = 0.5
-"""Largest share of the questions that may say nothing: without training, branches tie at a third of them."""
+SILENT = 0.1
+"""Largest share of the questions that may say nothing."""
 POINTS = 1000
 """Random questions by which every artefact is checked."""
 NUDGE, JUMP, TIE = 1e-4, 1e-4, 2e-6

@@ -88,7 +88,7 @@ def _runs(folder: Path, name: str) -> list[Run]:
     """
     if not (folder / RESULTS).exists():
         raise ValueError(f"no {RESULTS}: the job has only begun, or ended before it could write any")
-    content = _json(folder / RESULTS)
+    content = read_json(folder / RESULTS)
     content = content if at_work(folder, content) else {**content, **LOST}
     models = content.pop("models", None) or [{}]
     if not (isinstance(models, list) and all(isinstance(model, dict) for model in models)):
@@ -106,7 +106,12 @@ def at_work(folder: Path, content: Mapping[str, Any]) -> bool:
     return content.get("status") != "running" or held(folder / LOCK)
 
 
-def _json(path: Path) -> dict[str, Any]:
+def read_json(path: Path) -> dict[str, Any]:
+    """What a JSON file holds.
+
+    Raises:
+        ValueError: it cannot be read, or is no object.
+    """
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -133,7 +138,7 @@ def _run(folder: Path, name: str, content: Mapping[str, Any]) -> Run:
     with _noted(notes, "no learning curves"):
         found["curves"] = _curves(metrics) if metrics.exists() else {}
     with _noted(notes, "no episodes"):  # a name inside the folder, whatever the file says
-        played = _json(folder / Path(episodes).name).get("episodes") if isinstance(episodes, str) else []
+        played = read_json(folder / Path(episodes).name).get("episodes") if isinstance(episodes, str) else []
         found["episodes"] = _each(played, episode, "episode", notes)
     return run.model_copy(update=found)
 

@@ -122,7 +122,7 @@ class Artefact(abc.ABC):
         Raises:
             ValueError: another shape, or entries that are not finite.
         """
-        types = np.array(theta, np.float32)
+        types = np.array(theta, np.float32, order="C")  # a copy, whose rows C reads one after the other
         if types.ndim != 2 or types.shape[1] != self.about["players"] or not np.isfinite(types).all():
             raise ValueError(f"types must be finite, of shape (K, {self.about['players']}); got {types.shape}.")
         return self._many(types)

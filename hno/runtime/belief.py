@@ -25,10 +25,11 @@ class Learning(NamedTuple):
     """Standard deviation of a control's mean over one second around the prediction, in widths of the control box."""
     memory: float = math.inf
     """Time after which what was learned counts 1/e, s: the prior of a step is raised to exp(-dt / memory)."""
-    floor: float = 1e-3
-    """Least probability of a candidate, before they are scaled to the sum 1: a belief that was wrong can recover."""
+    floor: float = 0.009
+    """Least probability of a candidate in shares of an equal belief, 1 / K, before all are scaled to the sum 1: a
+    belief that was wrong can recover, and however many candidates there are, little is believed of unlikely ones."""
 
-    def check(self, candidates: int) -> None:
+    def check(self) -> None:
         """Refuse numbers that make no sense.
 
         Raises:
@@ -38,10 +39,8 @@ class Learning(NamedTuple):
             raise ValueError(f"noise must be a positive number of widths of the control box; got {self.noise!r}.")
         if not self.memory > 0:
             raise ValueError(f"memory must be a positive time in s, or inf; got {self.memory!r}.")
-        if not 0 <= self.floor * candidates < 1:
-            raise ValueError(
-                f"floor must be from 0 to below 1 / {candidates}, the number of candidates; got {self.floor!r}."
-            )
+        if not 0 <= self.floor < 1:
+            raise ValueError(f"floor must be a share of an equal belief, from 0 to below 1; got {self.floor!r}.")
 
     def updated(self, belief: Reals, miss: Reals, dt: float) -> Reals:
         """The belief after one step, by Bayes' rule.
@@ -52,12 +51,17 @@ class Learning(NamedTuple):
             belief: probabilities of K candidates, (..., K).
             miss: controls that were seen minus predictions, in widths of the control box, (..., K, D).
             dt: time for which the controls were held, s.
+
+        Raises:
+            ValueError: dt is no positive time.
         """
+        if not 0 < dt < math.inf:
+            raise ValueError(f"dt must be a positive time, s; got {dt!r}.")
         seen = -dt / (2 * self.noise**2) * np.square(miss).sum(-1)
         seen = np.where(np.isfinite(seen).all(-1, keepdims=True), seen, 0)
         with np.errstate(divide="ignore"):
             weight = math.exp(-dt / self.memory) * np.log(belief) + seen
-        found = np.maximum(_shares(np.exp(weight - weight.max(-1, keepdims=True))), self.floor)
+        found = np.maximum(_shares(np.exp(weight - weight.max(-1, keepdims=True))), self.floor / belief.shape[-1])
         return _shares(found)
 
 
@@ -120,7 +124,7 @@ class Believer:
             raise ValueError(f"Column {player} of types holds the player's own type, the same in every row.")
         rows = np.concatenate([candidates, candidates[:1]]) if acts == "mean" else candidates
         self._many = artefact.many(rows)
-        learning.check(len(candidates))
+        learning.check()
         self.belief = distribution(prior, (len(candidates),))
         self.types, self._player, self._learning, self._mean = candidates, player, learning, acts == "mean"
         self._predicted: Reals | None = None
@@ -141,6 +145,7 @@ class Believer:
 
         Raises:
             RuntimeError: it has not acted yet.
+            ValueError: dt is no positive time.
         """
         if self._predicted is None:
             raise RuntimeError("Nothing was predicted yet: call `act` first.")

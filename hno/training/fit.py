@@ -149,10 +149,7 @@ def fit(
     if settings.compile and settings.planned >= LONG:
         operator.compile_kernels()
     data.setup("fit")
-    if objective.scaled:
-        operator.set_scales(Scales(*data.scales()))
-    if data.train_rows is not None and data.train_rows.types is not None and data.train_rows.types.branch is not None:
-        operator.set_branches(data.train_rows.types.branch)
+    _learn_sizes(operator, objective, data)
     watch = ClosedLoopValidation(folder, settings.validate_every, dt=settings.dt, stop=settings.stop_when_safe)
     watch.begin(safe_sets(data.held_out()) if validation is None else validation, later)
     plan = data.labels
@@ -181,6 +178,14 @@ def fit(
     seconds |= {"added_labels": added} if adding.done else {}
     checkpoint = folder / (LAST if watch.best is None else BEST)  # a best one of another run does not count
     return Fitted(trainer, checkpoint, logbook.metrics, watch.best, adding.done, seconds)
+
+
+def _learn_sizes(operator: ValueOperator, objective: Objective, data: GameData) -> None:
+    """Tell an operator what it takes from the labels: sizes of values and costates, and which branches there are."""
+    if objective.scaled:
+        operator.set_scales(Scales(*data.scales()))
+    if data.train_rows is not None and data.train_rows.types is not None and data.train_rows.types.branch is not None:
+        operator.set_branches(data.train_rows.types.branch)
 
 
 def _check_room(folder: Path, operator: ValueOperator) -> None:

@@ -134,6 +134,18 @@ def test_a_place_without_a_model_and_a_foreign_certificate_are_refused(
     assert (run_folder / "certificate.json").read_text() == "{}"
 
 
+@pytest.mark.parametrize("text", ["", "[]", "{"])
+def test_results_of_an_evaluation_that_cannot_be_read_are_refused(
+    certify: Callable[..., Outcome], run_folder: Path, text: str
+) -> None:
+    """They may say that the seed chose the model."""
+    (run_folder / "results.json").write_text(text)
+    run = certify()
+    refused(run, "results.json")
+    assert run.code == 2
+    assert not (run_folder / "certificate.json").exists()
+
+
 def test_types_may_be_listed(certify: Callable[..., Outcome], run_folder: Path) -> None:
     run = certify("theta=1,1;2.5,4", "equilibria=0")
     assert "2 types, each as likely" in run.text

@@ -195,7 +195,7 @@ def no_search(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("no_search")
 def test_without_a_safe_start_every_section_says_so(command: Command, random_checkpoint: Path) -> None:
     both = f"checkpoint=[{random_checkpoint},{random_checkpoint}]"
-    run = command("evaluate", both, "theta=1,1", "clearance=50", "robustness=true", *FAST, "starts=2")
+    run = command("evaluate", both, "theta=1,1", "clearance=50", "robustness=true", *FAST)
     assert run.code == 0, run.text
     row = run.results["robustness"][0]
     (compared,) = run.results["comparison"]["models"]
@@ -250,6 +250,8 @@ def test_robustness_is_a_section_on_request(command: Command, random_checkpoint:
     costs = [row["median_excess_cost"] for row in rows.values()]
     assert len(set(costs)) == len(costs), "every condition changes something"
     assert "Robustness" in run.text
+    again = command("evaluate", *asked)
+    assert again.results["robustness"] == run.results["robustness"]
     assert "robustness" not in command("evaluate", *arguments).results
 
 

@@ -83,6 +83,7 @@ def test_each_player_plays_its_own_part_of_its_own_controller(one, two, capsys) 
         (["theta=1"], "theta must be 2 finite numbers"),
         (["theta=1,nan"], "theta must be 2 finite numbers"),
         (["sped=1"], "sped does not exist"),
+        (["~theta"], "~theta does not exist"),
         (["speed=0"], "speed must be greater than or equal to 0.05"),
         (["speed=nan"], "speed must be a finite number"),
         (["seed=1.5"], "seed must be a valid integer"),

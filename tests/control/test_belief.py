@@ -116,7 +116,7 @@ def test_to_assume_that_the_other_knows_me_misleads_while_it_learns() -> None:
 @pytest.mark.parametrize("memory", [math.inf, 0.7])
 def test_bayes_rule(memory: float) -> None:
     """Against the normal density of each step, multiplied up one candidate at a time."""
-    learning = Learning(0.05, memory, 0.01)
+    learning = Learning(0.05, memory, 0.04)
     policy = Believing(revealing, [0.0, 1.0, 2.5, 4.0], "mean", learning, [0.1, 0.2, 0.3, 0.4], game=GAME)
     x, theta, dt = starts(GAME, 3), torch.tensor([[1.0, 2.5], [4.0, 0.0], [0.5, 3.3]]), 0.1
     policy.reset(x, theta)
@@ -164,15 +164,26 @@ def steps_to_recover(learning: Learning, wrong: float, gain: float, dt: float) -
 
 
 def test_a_floor_bounds_the_time_to_recover() -> None:
-    """The log odds against the truth are log(1 / floor) at most, whatever was believed for how long."""
-    gain, dt, floor = 0.25, 0.1, 1e-3
+    """The log odds against the truth are log(K / floor) at most, whatever was believed for how long."""
+    gain, dt, floor = 0.25, 0.1, 2e-3
     learning = Learning(floor=floor)
     long = np.array([0.5, 0.5])
     for _ in range(500):
         long = learning.updated(long, np.array([[0.0], [1.0]]), dt)
-    bound = math.ceil(math.log(1 / floor) / gain)
+    bound = math.ceil(math.log(2 / floor) / gain)
     assert steps_to_recover(learning, long[0], gain, dt) in (bound, bound + 1)
     assert steps_to_recover(learning._replace(floor=0.0), 1 - 1e-15, gain, dt) > 2 * bound
+
+
+@pytest.mark.parametrize("count", [2, 9, 625])
+def test_however_many_candidates_there_are_the_truth_is_believed(count: int) -> None:
+    miss = np.ones((count, 1))
+    miss[0] = 0
+    belief = np.full(count, 1 / count)
+    for _ in range(100):
+        belief = Learning().updated(belief, miss, 0.1)
+    assert belief[0] > 0.99
+    np.testing.assert_allclose(belief[1:], Learning().floor / count, rtol=0.01)
 
 
 def test_forgetting_bounds_the_time_to_recover() -> None:
@@ -186,7 +197,7 @@ def test_forgetting_bounds_the_time_to_recover() -> None:
 
 
 def test_what_is_learned_in_a_second_does_not_depend_on_the_step() -> None:
-    learning, belief = Learning(0.05, 0.8, 1e-3), np.array([0.7, 0.2, 0.1])
+    learning, belief = Learning(0.05, 0.8, 3e-3), np.array([0.7, 0.2, 0.1])
     miss = np.array([[0.1], [0.03], [0.0]])
     ends = []
     for steps in (50, 2000):
@@ -381,8 +392,8 @@ def test_a_policy_with_memory_is_told_of_every_row() -> None:
         ({"types": []}, "must be finite candidates"),
         ({"learning": Learning(noise=0)}, "noise must be a positive"),
         ({"learning": Learning(memory=-1)}, "memory must be a positive"),
-        ({"learning": Learning(floor=0.2)}, "below 1 / 9"),
-        ({"learning": Learning(floor=math.nan)}, "below 1 / 9"),
+        ({"learning": Learning(floor=1.0)}, "to below 1"),
+        ({"learning": Learning(floor=math.nan)}, "to below 1"),
         ({"game": None}, "give `game`"),
     ],
 )

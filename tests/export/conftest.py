@@ -25,13 +25,18 @@ def operator_of(case: str) -> ValueOperator:
     options = {"members": int(members)}
     parts = Choice(function, options), Choice("deeponet", {"width": 12, "depth": 3}), Choice(activation)
     torch.manual_seed(0)
-    operator = make_operator(OWN[game]() if game in OWN else make(game), Architecture(*parts))
+    operator = apart(make_operator(OWN[game]() if game in OWN else make(game), Architecture(*parts)))
     operator.value_scale.fill_(40.0)
-    if operator.potential:  # branches are apart, as after training: the sides stand before the kind of function
+    return operator.eval().requires_grad_(False)
+
+
+def apart(operator: ValueOperator) -> ValueOperator:
+    """The same with branches apart, as after a few steps of training; random ones tie at a third of all states."""
+    if operator.potential:  # the sides stand before the kind of function
         players, pairs = operator.game.players, operator.sides.shape[-1]
         for network in operator.networks:
             network.branch.layers[0].weight.data[:, -(1 + players) - pairs : -(1 + players)] *= 10
-    return operator.eval().requires_grad_(False)
+    return operator
 
 
 @pytest.fixture(scope="session")

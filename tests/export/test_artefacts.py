@@ -32,7 +32,7 @@ from hno.runtime.artefact import ENTRIES
 from hno.training.checkpoint import Provenance, record
 from hno.training.saving import seal
 from tests.conftest import TEST
-from tests.export.conftest import operator_of
+from tests.export.conftest import apart, operator_of
 
 CASE = "narrow_road potential sin 1"
 SMALL = Architecture(Choice("potential"), Choice("deeponet", {"width": 8, "depth": 2}))
@@ -191,11 +191,10 @@ def test_a_controller_that_is_not_the_operator_is_not_written(tmp_path: Path, mo
 
 
 def test_a_checkpoint_is_exported_and_evaluated(tmp_path: Path, capsys: pytest.CaptureFixture[str], cache) -> None:
-    """Of a network without training, in which branches tie often."""
     torch.manual_seed(0)
     game = make("narrow_road")
     kept = record(game, SMALL, Provenance("sno", [(1.0, 1.0)], 3))
-    weights = {f"operator.{name}": weight for name, weight in make_operator(game, SMALL).state_dict().items()}
+    weights = {f"operator.{name}": weight for name, weight in apart(make_operator(game, SMALL)).state_dict().items()}
     (tmp_path / "best.ckpt").write_bytes(seal({"state_dict": weights, **kept}))
     assert main(["export", str(tmp_path), "--to", "numpy"]) == 0
     folder = Path(capsys.readouterr().out.strip())

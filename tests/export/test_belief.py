@@ -14,7 +14,7 @@ from hno.control.exported import load_exported
 from hno.runtime import Believer, load
 
 CASE = "narrow_road potential sin 1"
-LEARNING = Learning(noise=0.005, memory=0.5, floor=1e-3)
+LEARNING = Learning(noise=0.005, memory=0.5, floor=5e-3)
 KINDS = "c", "numpy"
 Exported = Callable[[str, str], Path]
 
@@ -55,7 +55,8 @@ def test_it_is_the_policy_with_beliefs_for_one_player(exported: Exported, kind: 
 def test_many_types_at_one_state_are_what_each_gets_alone(exported: Exported, kind: str) -> None:
     artefact, generator = load(exported(CASE, kind)), np.random.default_rng(1)
     types, (tau, x, _) = generator.uniform(1, 5, (7, 2)), motion(1)[0]
-    many = artefact.many(types)
+    many, transposed = artefact.many(types), artefact.many(np.asfortranarray(types))
+    np.testing.assert_array_equal(transposed(tau, x), many(tau, x))
     for _ in range(2):
         batch = artefact.answers([tau] * 7, [x] * 7, types)["control"]
         np.testing.assert_allclose(many(tau, x), batch, atol=1e-4)
@@ -93,6 +94,16 @@ def test_options_that_make_no_sense(exported: Exported, options: dict[str, objec
     given = {"player": 0, "types": candidates(0, 2.0), **options}
     with pytest.raises(ValueError, match=message):
         Believer(load(exported(CASE, "numpy")), **given)
+
+
+@pytest.mark.parametrize("dt", [0.0, -0.1, np.nan, np.inf])
+def test_times_that_make_no_sense_are_refused(exported: Exported, dt: float) -> None:
+    player, (tau, x, u) = Believer(load(exported(CASE, "numpy")), 0, candidates(0, 2.0)), motion(1)[0]
+    player.act(tau, x)
+    before = player.belief.copy()
+    with pytest.raises(ValueError, match="dt must be a positive time"):
+        player.observe(u, dt)
+    np.testing.assert_array_equal(player.belief, before)
 
 
 def test_to_observe_before_acting_is_an_error(exported: Exported) -> None:
