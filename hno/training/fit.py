@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -158,7 +157,6 @@ def fit(
     guard = SaveOnSignal(folder, lambda step: step in adding.due or watch.due(step, settings.steps))
     own = [guard, adding, watch, Polish(settings.polish, watch), logbook]
     trainer = make_trainer(settings, folder, loggers, [*own, *callbacks])
-    data.between = partial(guard.between, trainer)
     remove_drafts(folder)
     if resume is not None:
         check_training_state(resume, read_content(resume), settings.steps)

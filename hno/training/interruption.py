@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import lightning as L
 
+from hno.data import GameData
 from hno.processes import Interrupted, stop_if_asked, take_back_signals
 from hno.training.saving import LAST
 
@@ -27,7 +29,12 @@ class SaveOnSignal(L.Callback):
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Take signals back from Lightning, which ends trainings without a checkpoint."""
         self.saved = trainer.global_step
+        _call_between_steps(trainer, partial(self.between, trainer))
         take_back_signals()
+
+    def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """The data may go on to another training."""
+        _call_between_steps(trainer, stop_if_asked)
 
     def between(self, trainer: L.Trainer) -> None:
         """Save what would take long to come to again; the step before is complete, its losses are logged."""
@@ -39,7 +46,14 @@ class SaveOnSignal(L.Callback):
         """Save, unless a step is half done."""
         if isinstance(exception, Interrupted) and exception.between and trainer.global_step > 0:
             self._save(trainer)
+        _call_between_steps(trainer, stop_if_asked)
 
     def _save(self, trainer: L.Trainer) -> None:
         self.saved = trainer.global_step
         trainer.save_checkpoint(self.path, weights_only=False)
+
+
+def _call_between_steps(trainer: L.Trainer, between: Callable[[], None]) -> None:
+    data = getattr(trainer, "datamodule", None)
+    if isinstance(data, GameData):
+        data.between = between

@@ -190,6 +190,13 @@ def test_a_controller_that_is_not_the_operator_is_not_written(tmp_path: Path, mo
     assert not list(tmp_path.iterdir())
 
 
+def test_an_operator_whose_branches_tie_says_too_little_to_be_checked(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    with pytest.raises(ExportError, match=r"2\d\.\d% of the questions say nothing \(10% are allowed\)"):
+        export(make_operator(make("narrow_road"), SMALL).requires_grad_(False), "numpy", tmp_path / "new")
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_checkpoint_is_exported_and_evaluated(tmp_path: Path, capsys: pytest.CaptureFixture[str], cache) -> None:
     torch.manual_seed(0)
     game = make("narrow_road")

@@ -6,7 +6,7 @@ import json
 import os
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ import torch
 
 import hno
 from hno import processes
-from hno.cli import evaluate
+from hno.cli import calls, evaluate
 from hno.cli.logs import StepLines
 from hno.processes import Interrupted, interruptible, interruptible_call, stop_if_asked, waiting_signals
 from hno.training.saving import LAST, read_content
@@ -135,6 +135,14 @@ def test_a_signal_ends_a_training_that_a_program_calls(tmp_path: Path, cache: Pa
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
     assert read_content(tmp_path / LAST)["global_step"] == 7
     assert json.loads((tmp_path / "results.json").read_text())["reason"] == "SIGTERM"
+
+
+@pytest.mark.parametrize("call", [hno.train, hno.evaluate, hno.certify])
+def test_every_call_ends_in_its_exit_code(monkeypatch: pytest.MonkeyPatch, call: Callable[[str], object]) -> None:
+    monkeypatch.setattr(calls, "_overrides", lambda *given: send())
+    with pytest.raises(SystemExit) as stop:
+        call("narrow_road")
+    assert stop.value.code == 143
 
 
 @pytest.mark.parametrize(("name", "end"), [("SIGINT", KeyboardInterrupt), ("SIGHUP", SystemExit)])

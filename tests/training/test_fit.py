@@ -20,6 +20,7 @@ from hno.games import make
 from hno.losses import LossTerm, Objective, View, make_objective
 from hno.operators import Choice, ValueOperator
 from hno.operators import make_operator as built
+from hno.processes import stop_if_asked
 from hno.training import Fitted, Settings, fit
 from hno.training.checkpoint import Provenance, load_operator, record
 from hno.training.fit import LAST
@@ -196,6 +197,7 @@ def test_what_comes_back_is_the_best_or_the_last_checkpoint(tmp_path: Path) -> N
     entries = record(operator.game, architecture(), Provenance("mine", TYPES))
     found = fit(operator, objective, data, settings(), folder, validation=[], record=entries)
     assert (found.best, found.checkpoint) == (None, folder / LAST)
+    assert data.between is stop_if_asked, "batches that are drawn later save nothing in its folder"
     points = random_points(operator.game)
     loaded, _, origin = load_operator(found.checkpoint)
     assert all(map(torch.equal, loaded.field(points), operator.field(points)))
