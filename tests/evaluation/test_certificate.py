@@ -21,6 +21,7 @@ from hno.evaluation.certificate import (
     draw,
     play,
     ranking,
+    region,
 )
 from hno.evaluation.metrics import upper_bound
 from hno.games import Box, ControlAffineGame
@@ -203,6 +204,31 @@ def test_bounds_grow_with_collisions_and_shrink_with_tests() -> None:
     assert over[-1] == 1
     assert upper_bound(2, 100, 0.01) < upper_bound(2, 50, 0.01) < upper_bound(2, 50, 0.001)
     assert certified(equilibria=0).every.bound == upper_bound(certified(equilibria=0).every.collisions, 120, BETA)
+
+
+def test_few_tests_that_say_who_is_a_member_are_not_taken_for_all() -> None:
+    """A fifth are members, and half of these are hits; of 20 tests the share of members is known badly."""
+    generator, wrong = torch.Generator().manual_seed(0), 0
+    for _ in range(REPEATS):
+        members = torch.rand(2000, generator=generator) < 0.2
+        hits = members & (torch.rand(2000, generator=generator) < 0.5)
+        wrong += conditional_bound(hits, members, 20, BETA) < 0.5
+    assert wrong <= binom.ppf(0.999, REPEATS, BETA)
+
+
+def test_no_region_is_tried_after_one_that_failed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is told apart best collides there, and the larger regions that hold it would pass."""
+    count, plan = 2000, Plan(2000, BETA, target=0.05)
+    margin, none = torch.arange(count, 0, -1).float(), torch.zeros(count, dtype=torch.bool)
+    hits = none.clone()
+    monkeypatch.setattr(certificate, "margins", lambda *given: {"value": margin})
+    chosen, fine = (Trials(torch.zeros(count, 1, 3), torch.zeros(count, 1), none) for _ in range(2))
+    found = region(controller(), chosen, fine, plan)
+    assert found is not None
+    assert (found.level, found.tests) == (None, count)
+    hits[:40] = True
+    assert upper_bound(40, count, BETA) < plan.target
+    assert region(controller(), chosen, fine._replace(collided=hits), plan) is None
 
 
 def test_without_members_nothing_is_known() -> None:
