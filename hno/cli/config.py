@@ -50,7 +50,8 @@ class Folders(SearchPathPlugin):
     @classmethod
     def all(cls) -> list[Path]:
         """Every folder, ours first."""
-        points = [point for kind in REGISTRIES for point in entry_points(group=f"hno.{plural(kind)}")]
+        every = entry_points()  # once: it reads what every installed package says
+        points = [point for kind in REGISTRIES for point in every.select(group=f"hno.{plural(kind)}")]
         packages = sorted({point.value.partition(":")[0].split(".")[0].strip() for point in points})
         specs = (importlib.util.find_spec(name) for name in packages if name.isidentifier())
         places = [Path(place) for spec in specs if spec for place in spec.submodule_search_locations or ()]
@@ -69,19 +70,25 @@ def groups(name: str) -> list[str]:
     return [str(group) for entry in defaults if OmegaConf.is_dict(entry) for group in entry]
 
 
-def choices(group: str) -> dict[str, Path | None]:
-    """Choices of a group and their files; those of plugins without a file have none. Nothing is imported."""
+def choices(group: str, folders: Sequence[Path] | None = None) -> dict[str, Path | None]:
+    """Choices of a group and their files; those of plugins without a file have none. Nothing is imported.
+
+    Args:
+        group: of configurations.
+        folders: where files are; `Folders.all()` by default.
+    """
     found: dict[str, Path | None] = {}
     if group in CHOSEN:
         found = {point.name: None for point in entry_points(group=f"hno.{plural(group)}")}
-    files = (path for folder in Folders.all() for path in (folder / group).glob("*.yaml"))
+    files = (path for folder in folders or Folders.all() for path in (folder / group).glob("*.yaml"))
     return dict(sorted({**found, **{path.stem: path for path in files}}.items()))
 
 
 def register_plugins() -> None:
     """Make every registered name without a file a choice of its group, with its options and their defaults."""
+    folders = Folders.all()
     for group in CHOSEN:
-        registry, have = REGISTRIES[group](), choices(group)
+        registry, have = REGISTRIES[group](), choices(group, folders)
         for name in registry.names():
             if have.get(name) is None:
                 options = options_of(registry.get(name), skip=GIVEN.get(group, ()))

@@ -31,6 +31,7 @@ from tests.cli.conftest import SMOKE, Command, Outcome
 from tests.fakes import fake_labels
 
 GAMES, OPERATORS, ACTIVATIONS = ("narrow_road", "lane_change", "drone"), ("hno", "sno"), ("tanh", "sin", "relu")
+FAST = {("narrow_road", "sno", "sin"), *((game, "hno", "sin") for game in GAMES)}
 KEYS = {
     "status", "reason", "game", "operator", "activation", "seed", "steps", "training_hash", "seconds", "table",
     "versions", "config", "episodes",
@@ -55,12 +56,11 @@ def losses(folder: Path) -> list[dict[str, str]]:
     ("game", "operator", "activation", "function"),
     [
         *(
-            pytest.param(
-                *parts, "potential", marks=() if "narrow_road" in parts or "sin" in parts else pytest.mark.slow
-            )
+            pytest.param(*parts, "potential", marks=() if parts in FAST else pytest.mark.slow)
             for parts in itertools.product(GAMES, OPERATORS, ACTIVATIONS)
         ),
-        *((game, "hno", "sin", "value") for game in GAMES),
+        ("narrow_road", "hno", "sin", "value"),
+        *(pytest.param(game, "hno", "sin", "value", marks=pytest.mark.slow) for game in GAMES[1:]),
     ],
 )
 def test_five_steps(command: Command, game: str, operator: str, activation: str, function: str) -> None:

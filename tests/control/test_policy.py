@@ -90,7 +90,7 @@ def test_the_costate_is_the_derivative_of_the_value() -> None:
         torch.testing.assert_close(value(x, tau, theta), policy.answer(tau, x, theta).costate, **TIGHT)
 
 
-@pytest.mark.parametrize("members", [1, 3])
+@pytest.mark.parametrize("members", [1, pytest.param(3, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("mapped", [False, True])
 def test_the_answer_compiles(members: int, mapped: bool) -> None:
     policy, points = asked(members)

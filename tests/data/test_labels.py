@@ -221,9 +221,8 @@ def test_labels_are_equal_bit_for_bit_however_they_are_split(
     assert bool((labels("narrow_road").status == Status.CONVERGED).all())
     for module in (label_data, shards):
         monkeypatch.setattr(module, "SHARD", 2)
-    for workers in (1, 2):
-        assert bits(labels_for(game, [TRAIN], tmp_path / str(workers), workers=workers)[0][0]) == once
-    for starts in (1, 3, 4):
+    assert bits(labels_for(game, [TRAIN], tmp_path / "two", workers=2)[0][0]) == once
+    for starts in (1, 4):
         (found,), _ = labels_for(game, [TRAIN._replace(starts=starts)], tmp_path / "grown", workers=1)
     assert bits(found) == once
 

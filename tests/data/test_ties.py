@@ -45,10 +45,12 @@ def test_the_two_best_equilibria_of_a_tie_cost_nearly_the_same() -> None:
         assert second - first <= TIE * first
 
 
+@pytest.mark.slow
 def test_more_ties_begin_with_the_fewer() -> None:
     assert torch.equal(states(1), states(2)[:1])
 
 
+@pytest.mark.slow
 def test_ties_do_not_depend_on_how_many_pairs_are_tried_together(monkeypatch: pytest.MonkeyPatch) -> None:
     once = states(1)
     monkeypatch.setattr(ties, "BATCH", 5)

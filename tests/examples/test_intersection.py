@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 
 from hno.games import make
 from tests.examples.conftest import Train
 
 
+@pytest.mark.slow
 def test_trains_to_values_in_which_types_of_each_player_matter(train: Train):
     game = make("intersection")
     trained = train(game, [(1, 1), (1, 5), (5, 1)], steps=400)

@@ -12,6 +12,8 @@ from hno.games import Game, make
 
 NAMES = ("narrow_road", pytest.param("lane_change", marks=pytest.mark.slow), "drone")
 """The second has the dynamics of the first."""
+FIRST = ("narrow_road", *(pytest.param(name, marks=pytest.mark.slow) for name in ("lane_change", "drone")))
+"""Where solving takes seconds."""
 ENCOUNTERS = {
     "narrow_road": [[34.6, 4.5, 0.03, 21.0], [35.3, 3.2, -0.02, 19.0]],
     "lane_change": [[40.0, 3.0, 0.05, 20.0], [41.4, 5.3, -0.06, 22.0]],

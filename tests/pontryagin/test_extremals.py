@@ -135,7 +135,7 @@ def test_controls_maximise_the_hamiltonian_within_their_box(name):
     assert game.control_box.widened(1 + 1e-6).contains(found.u.flatten(0, 2)).all()
 
 
-@pytest.mark.parametrize("name", ["narrow_road", "drone"])
+@pytest.mark.parametrize("name", ["narrow_road", pytest.param("drone", marks=pytest.mark.slow)])
 def test_swapping_the_players_swaps_the_solution(name):
     game = make(name)
     x0, theta = starts(game, 2), types(2, 1, 5)

@@ -15,7 +15,7 @@ from hno.pontryagin.newton import Newton
 from hno.pontryagin.online import first_plan, planned_control, remaining, replan, subgame
 from hno.types import Status
 from tests.lq import open_loop_nash, random_game
-from tests.pontryagin.encounters import NAMES, starts, types
+from tests.pontryagin.encounters import FIRST, starts, types
 from tests.walkers import Walkers
 
 HOPELESS = Solver(newton=Newton(tolerance=0.0, steps=2, full_steps=1))
@@ -69,7 +69,7 @@ def test_the_rest_of_a_label_solves_the_rest_of_its_game():
     torch.testing.assert_close(found.value, label.value[:, 7:], rtol=1e-4, atol=1e-3)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", FIRST)
 def test_a_warm_start_finds_what_a_search_finds(name):
     """Where players have left their plan a little, Newton from the rest of the plan needs no search."""
     game, theta = make(name).double(), types(2, 1, 1)
@@ -119,7 +119,7 @@ def test_a_first_plan_that_is_not_solved_is_the_best_attempt():
     assert bool(planned_control(game, plan.at).isfinite().all())
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", FIRST)
 def test_one_control_step_is_a_game_too(name):
     game, theta = make(name), types(1, 1, 1)
     found = solve(subgame(game, 0.02), starts(game, 1), theta)
