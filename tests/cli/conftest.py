@@ -21,7 +21,7 @@ from hno.training.checkpoint import Provenance, record
 from hno.training.saving import seal
 from tests.fakes import small_architecture
 
-SMOKE = ("experiment=smoke", "data.types=[[1,1]]", "data.workers=1", "evaluation.dt=0.1")
+SMOKE = ("experiment=smoke", "data.types=[[1,1]]", "data.workers=1", "evaluation.dt=0.25")
 """A run of seconds, on labels that every test shares."""
 
 

@@ -176,8 +176,7 @@ def own_cache(labels: Callable[..., Extremal], tmp_path: Path) -> Path:
     return tmp_path / "labels"
 
 
-@pytest.mark.parametrize("split", ["train", "test"])
-@pytest.mark.parametrize("damage", ["truncated", "flipped"])
+@pytest.mark.parametrize(("split", "damage"), [("train", "truncated"), ("test", "flipped")])
 def test_damaged_label_file(command: Command, own_cache: Path, split: str, damage: str) -> None:
     (path,) = own_cache.rglob(f"1-1_{split}*/shard-*.safetensors")
     sound = path.read_bytes()

@@ -53,7 +53,7 @@ def test_results_and_table_are_those_of_the_best_checkpoint(command: Command, sc
     tables = []
     for name in ("best", "last"):
         again = command(
-            "evaluate", f"checkpoint={run.folder}/{name}.ckpt", "theta=1,1", "workers=1", "starts=4", "dt=0.1",
+            "evaluate", f"checkpoint={run.folder}/{name}.ckpt", "theta=1,1", "workers=1", "starts=4", "dt=0.25",
             folder=tmp_path / name,
         )  # fmt: skip
         tables.append(again.results["table"])
@@ -153,7 +153,7 @@ def test_bad_input_is_answered_before_any_label_is_solved(
     refused(command("train", *SMOKE, *overrides), message)
 
 
-@pytest.mark.parametrize("stop", [True, False])
+@pytest.mark.parametrize("stop", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_run_ends_once_it_is_safe_if_asked(command: Command, scores: Scores, stop: bool) -> None:
     scores({2: Score(0.5, 0.3), 4: Score(0.0, 0.2), 6: Score(0.0, 0.3), 8: Score(0.1, 0.0)})
     run = command("train", *EIGHT, f"validation.stop_when_safe={str(stop).lower()}")
@@ -266,7 +266,10 @@ ALL_ELSE = (
 
 @pytest.mark.parametrize(
     "recipe",
-    [pytest.param(ROLLOUT, id="rollout states"), pytest.param(ALL_ELSE, id="all else", marks=pytest.mark.slow)],
+    [
+        pytest.param(ROLLOUT, id="rollout states", marks=pytest.mark.slow),
+        pytest.param(ALL_ELSE, id="all else", marks=pytest.mark.slow),
+    ],
 )
 def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(
     command: Command, tmp_path: Path, recipe: tuple[str, ...]
@@ -334,7 +337,7 @@ def test_disturbances_reach_the_table(
         run = command("train", *SMOKE, "trainer.max_steps=1", "evaluation.noise=0.1", "evaluation.delay=2")
     else:
         run = command(
-            "evaluate", f"checkpoint={random_checkpoint}", "theta=1,1", "workers=1", "starts=4", "dt=0.1", "noise=0.1",
+            "evaluate", f"checkpoint={random_checkpoint}", "theta=1,1", "workers=1", "starts=4", "dt=0.25", "noise=0.1",
             "delay=2",
         )  # fmt: skip
     assert run.code == 0, run.text
@@ -344,7 +347,7 @@ def test_disturbances_reach_the_table(
 
 def test_safe_starts_by_number(command: Command, random_checkpoint: Path) -> None:
     run = command(
-        "evaluate", f"checkpoint={random_checkpoint}", "theta=1,1", "workers=1", "starts=3", "dt=0.1", "safe=true"
+        "evaluate", f"checkpoint={random_checkpoint}", "theta=1,1", "workers=1", "starts=3", "dt=0.25", "safe=true"
     )
     assert run.code == 0, run.text
     (row,) = run.results["table"]

@@ -22,7 +22,7 @@ def test_the_new_game_passes_its_test_and_trains_once_it_is_installed(tmp_path: 
     pip = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--no-index", "--no-build-isolation"]
     subprocess.run([*pip, "--target", site, folder], check=True, capture_output=True, text=True)
     python("-m", "pytest", "-q", str(folder / "tests"), path=(site,), folder=folder)
-    small = ("experiment=smoke", "data.types=1,1", "data.workers=1", "evaluation.dt=0.1", "trainer.max_steps=2")
+    small = ("experiment=smoke", "data.types=1,1", "data.workers=1", "evaluation.dt=0.25", "trainer.max_steps=2")
     commands = [
         ["list", "games"],
         ["train", "game=corridor_pass", "--help"],

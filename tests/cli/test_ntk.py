@@ -16,7 +16,7 @@ from hno.types import Status
 from tests.cli.conftest import SMOKE, Command, refused
 from tests.fakes import fake_labels, small_architecture
 
-FAST = ("workers=1", "starts=4", "dt=0.1")
+FAST = ("workers=1", "starts=4", "dt=0.25")
 
 
 def test_the_kernel_at_training_types_is_in_the_results(command: Command, random_checkpoint: Path) -> None:

@@ -62,7 +62,7 @@ def test_a_game_registered_in_a_test_trains_without_touching_the_core(command: C
     assert run.results["table"][0]["starts"] == 4
     policy = hno.load_policy(run.folder / "last.ckpt")
     assert isinstance(policy.game, Walkers)
-    again = command("evaluate", f"checkpoint={run.folder}/last.ckpt", "theta=1,1", "workers=1", "starts=4", "dt=0.1")
+    again = command("evaluate", f"checkpoint={run.folder}/last.ckpt", "theta=1,1", "workers=1", "starts=4", "dt=0.25")
     assert again.code == 0, again.text
     assert again.results["table"] == run.results["table"]
 
@@ -86,7 +86,7 @@ def test_constants_of_a_registered_game(command: Command) -> None:
 def test_default_types_stay_within_the_game(command: Command) -> None:
     games.register("walkers")(Walkers)
     run = command("train", *SMOKE, "game=walkers", "trainer.max_steps=1")
-    again = command("evaluate", f"checkpoint={run.folder}/last.ckpt", "workers=1", "starts=1", "dt=0.1")
+    again = command("evaluate", f"checkpoint={run.folder}/last.ckpt", "workers=1", "starts=1", "dt=0.25")
     assert [row["theta"] for row in again.results["table"]] == [[1, 1], [0, 1], [1, 3], [3, 4]]
 
 

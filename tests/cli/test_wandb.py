@@ -22,7 +22,7 @@ ROOT = Path(__file__).parents[2]
 def multirun(folder: Path, *overrides: str) -> str:
     """Run the multirun command of the documentation, tiny, as a process of its own."""
     arguments = [sys.executable, str(ROOT / "train.py"), "-m", *overrides, "experiment=smoke", "logger=wandb"]
-    small = ["data.types=[[1,1]]", "data.workers=1", "trainer.max_steps=5", "evaluation.dt=0.1"]
+    small = ["data.types=[[1,1]]", "data.workers=1", "trainer.max_steps=5", "evaluation.dt=0.25"]
     environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "HOME": str(folder)}
     done = subprocess.run(
         [*arguments, *small, f"hydra.sweep.dir={folder}/sweep"],
