@@ -117,7 +117,7 @@ def main(given: Sequence[str] | None = None, prog: str | None = None) -> int:
         print(one_screen(str(error)), file=sys.stderr)
         return 2 if isinstance(error, UsageError) else 1
     except Interrupted as stop:
-        print(f"Interrupted by {stop}.", file=sys.stderr)
+        print(". ".join([f"Interrupted by {stop}", *getattr(stop, "__notes__", [])]) + ".", file=sys.stderr)
         return stop.code
     except KeyboardInterrupt:  # of a program that calls this in a thread
         print("Interrupted.", file=sys.stderr)

@@ -18,7 +18,7 @@ import torch
 import hno
 from hno import processes
 from hno.cli import calls, evaluate
-from hno.cli.logs import StepLines
+from hno.cli.progress import StepLines
 from hno.processes import Interrupted, interruptible, interruptible_call, stop_if_asked, waiting_signals
 from hno.training.saving import LAST, read_content
 from tests.cli import conftest
