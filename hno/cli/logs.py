@@ -60,9 +60,7 @@ def loggers(settings: TrainSettings, folder: Path, first: int = 0) -> list[Logge
 
 def _wandb(settings: TrainSettings, folder: Path, mode: str) -> Logger:
     """The run of the folder, if W&B left one there: it ends the names of its own folders with the run's id."""
-    import wandb
-
-    wandb.setup(wandb.Settings(silent=True))  # what it says is in its files, and here where it is
+    os.environ.setdefault("WANDB_SILENT", "true")  # what it says is in its files, and here where those are
     known = sorted(folder.glob("wandb/*run-*-*"))
     logger = WandbLogger(
         name=folder.name, save_dir=folder, mode=mode, project=settings.logger.project, group=folder.parent.name,

@@ -38,7 +38,10 @@ def print_table(
     """
     if title:
         console.print(Text(title, "bold"), soft_wrap=True)
-    widths = [_width(*column) for column in zip(titles, zip(*rows, strict=True), strict=True)]
+    columns = [(title, [row[at] for row in rows]) for at, title in enumerate(titles)]
+    widths = [max(len(title), _width("", cells)) for title, cells in columns]
+    if sum(widths) + GAP * (len(widths) - 1) > console.width:
+        widths = [_width(*column) for column in columns]
     for part in parts(widths, console.width):
         table = Table(box=SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, GAP - 1, 0, 0))
         for column in part:
@@ -51,7 +54,7 @@ def print_table(
 
 
 def _width(title: str, cells: Sequence[str]) -> int:
-    """Of a column: titles fold at blanks, cells too where they are long."""
+    """Of a column whose title folds at blanks, as cells do where they are long."""
     words = max(map(len, title.split()), default=1)
     longest = max(map(len, cells), default=1)
     if longest > PROSE:
