@@ -157,7 +157,9 @@ def _swept(task: Task, words: Sequence[str], folder: Path, dry: bool) -> int:
             if found and not dry:
                 show_jobs([entry.job for entry in found])
         if ledger.signal is not None:
-            raise Interrupted(ledger.signal)
+            stop = Interrupted(ledger.signal)
+            stop.add_note(f"{counted(len(found), 'job')} had begun. Go on with each by: hno train resume=<its folder>")
+            raise stop
     refused = sum(not entry.succeeded for entry in found)
     if dry:
         print(counted(len(found), "job") + (f", {refused} refused" if refused else ""))

@@ -15,7 +15,7 @@ GAP = 2
 """Characters between columns, one of which is the box's."""
 PROSE = 32
 """Width from which on a cell may take several lines."""
-WIDTH = 140
+WIDTH = 160
 """Columns of text where there is no terminal to ask."""
 
 
