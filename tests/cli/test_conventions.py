@@ -11,7 +11,6 @@ from typing import Any
 
 import lightning as L
 import pytest
-from hydra._internal.core_plugins.basic_launcher import BasicLauncher
 
 from hno.cli import launch
 from hno.cli.arguments import Arguments
@@ -97,7 +96,15 @@ def test_debug_is_laid_over_an_experiment() -> None:
 
 def test_a_run_that_stops_early_is_finished(command: Command) -> None:
     early = ["callbacks.early_stopping={patience: 1, min_delta: 100}", "callbacks.learning_rate={}"]
-    run = command("train", *SMOKE, *early, "trainer.max_steps=30", "trainer.validate_every=2", "profiler=simple")
+    run = command(
+        "train",
+        *SMOKE,
+        *early,
+        "trainer.max_steps=30",
+        "trainer.validate_every=2",
+        "profiler=simple",
+        "trainer.log_every_n_steps=1",
+    )
     assert run.code == 0, run.text
     assert run.results["steps"] == 4
     rows = list(csv.DictReader((run.folder / "csv" / "metrics.csv").open()))
@@ -127,19 +134,17 @@ def test_a_failed_job_and_one_without_the_number_return_none(caplog: pytest.LogC
 
 
 def test_the_sweeper_sees_what_jobs_return(command: Command, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    seen, original = list[Any](), BasicLauncher.launch
+    seen, original = list[Any](), launch.under_hydra
 
     def performed(task: Any, chosen: TrainSettings, folder: Path) -> Any:
         content = {"metrics": {"loss/total": float(chosen.seed)}, "table": [], "seconds": {}}
         return SimpleNamespace(content=content) if chosen.seed else None
 
-    def launched(self: Any, *given: Any, **named: Any) -> Any:
-        found = original(self, *given, **named)
-        seen.extend(job.return_value for job in found)
-        return found
+    def under_hydra(name: str, job: Any, words: Any) -> None:
+        original(name, lambda config: seen.append(job(config)), words)
 
     monkeypatch.setattr(launch, "perform", performed)
-    monkeypatch.setattr(BasicLauncher, "launch", launched)
+    monkeypatch.setattr(launch, "under_hydra", under_hydra)
     words = ["-m", *SMOKE, "objective=loss/total", "seed=0,3", f"hydra.sweep.dir={tmp_path / 'sweep'}"]
     assert command("train", *words, folder="none").code == 1
     assert seen == [None, 3.0]
