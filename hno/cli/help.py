@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import re
+import sys
+import textwrap
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
+from shutil import get_terminal_size
 from typing import Any
 
 import yaml  # type: ignore[import-untyped]  # yaml has no annotations
@@ -59,7 +62,7 @@ def configuration_help(name: str, given: Arguments) -> str:
     text = yaml.dump(OmegaConf.to_container(config, resolve=False), Dumper=_Flow, sort_keys=False, width=10**6)
     lines = [(f"  {line}".replace(": ???", ": (required)"), key) for line, key in _keyed(text)]
     keys = [f"{line:<{BESIDE - 2}}  # {said[key]}" if key in said else line for line, key in lines]
-    return head + "Keys, key=value\n" + "\n".join(keys)
+    return head + "Keys, key=value\n" + "\n".join(_folded(line, " " * BESIDE + "# ") for line in keys)
 
 
 class _Flow(yaml.SafeDumper):  # type: ignore[misc]  # yaml has no annotations
@@ -92,7 +95,14 @@ def _group(group: str, known: Mapping[str, Path | None], chosen: Collection[str]
     for choice, path in known.items():
         mark = "*" if choice in chosen else " "
         lines.append(f"    {mark} {choice:<16}{'' if path is None else heading(path)}".rstrip())
-    return "\n".join(lines)
+    return "\n".join(_folded(line, " " * 22) for line in lines)
+
+
+def _folded(line: str, indent: str) -> str:
+    """A line as wide as the terminal, if there is one; what follows is indented."""
+    if not sys.stdout.isatty():
+        return line
+    return textwrap.fill(line, max(60, get_terminal_size().columns), subsequent_indent=indent, break_long_words=False)
 
 
 def comments(text: str) -> Iterator[tuple[str, str]]:

@@ -22,7 +22,7 @@ from hno.cli import pages
 from hno.cli.arguments import Arguments, UsageError, one_screen, quoted
 from hno.cli.config import REFUSALS, configured, for_hydra, register_plugins, sentence, under_hydra
 from hno.cli.logs import finish_wandb
-from hno.cli.media import numbers
+from hno.cli.objective import Objective, objective
 from hno.cli.output import fresh, owned
 from hno.cli.progress import collect_messages
 from hno.cli.results import Results, recorded
@@ -231,25 +231,6 @@ def perform(task: Task, settings: Any, folder: Path) -> Results | None:
         finish_wandb(results.content)
     show(results.content, folder)
     return results
-
-
-Objective = float | list[float] | None
-"""What a job returns to its sweeper."""
-
-
-def objective(settings: Any, results: Results | None) -> Objective:
-    """The numbers of a job that its sweeper compares, by the names under `objective`.
-
-    A failed job has none, which sweepers that search, Optuna's for one, count as a failed trial.
-    """
-    if results is None:
-        return None
-    found = {**results.content.get("metrics", {}), **numbers(results.content)}
-    wanted = settings.objective if isinstance(settings.objective, list) else [settings.objective]
-    if absent := [name for name in wanted if name not in found]:
-        log.warning("objective: this run has no number %s; it has %s.", ", ".join(absent), ", ".join(sorted(found)))
-        return None
-    return [found[name] for name in wanted] if isinstance(settings.objective, list) else found[wanted[0]]
 
 
 def _log(error: Exception) -> None:

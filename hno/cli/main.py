@@ -75,8 +75,8 @@ COMMANDS = {
     ),
     "list": Command(
         "hno.cli.listing:run", "[KIND ...]",
-        "List what is registered: games, methods, networks, activations, losses, sources and optimizers, each with the "
-        "package that it comes from.",
+        "List what is registered: games, methods, networks, activations, losses, sources, optimizers and callbacks, "
+        "each with the package that it comes from.",
     ),
     "new-game": Command(
         "hno.cli.new_game:run", "NAME [--to FOLDER]",

@@ -113,7 +113,7 @@ class TrainerSettings(Settings):
     @property
     def lightning(self) -> dict[str, Any]:
         """Further arguments of Lightning's trainer."""
-        return dict(self.model_extra or {})
+        return self.model_extra or {}
 
 
 class LoggerSettings(Settings):

@@ -16,7 +16,7 @@ from hno.cli import launch
 from hno.cli.arguments import Arguments
 from hno.cli.config import read
 from hno.cli.help import configuration_help
-from hno.cli.launch import objective
+from hno.cli.objective import objective
 from hno.cli.resume import training_hash
 from hno.cli.settings import COMMANDS, TrainSettings
 from hno.training.callbacks import callbacks
