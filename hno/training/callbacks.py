@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 from typing import Literal
 
+import lightning as L
 from lightning.pytorch.callbacks import (
     Callback,
     DeviceStatsMonitor,
@@ -19,6 +20,12 @@ callbacks: Registry[Callback] = Registry("callback", "hno.training", base="light
 """Callbacks: subclasses of Lightning's, or functions (**options) that build one."""
 
 
+class _EarlyStopping(EarlyStopping):
+    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """A run that it had ended is not trained on."""
+        trainer.should_stop |= self.wait_count >= self.patience
+
+
 @callbacks.register("early_stopping")
 def early_stopping(
     monitor: str = "val/costate_error", patience: int = 5, min_delta: float = 0.0, mode: str = "min"
@@ -31,7 +38,7 @@ def early_stopping(
         min_delta: what counts as one.
         mode: "min" or "max".
     """
-    return EarlyStopping(monitor, min_delta, patience, mode=mode)
+    return _EarlyStopping(monitor, min_delta, patience, mode=mode)
 
 
 @callbacks.register("learning_rate")
