@@ -58,7 +58,7 @@ def progress(name: str, say: Callable[..., None] | None = log.info) -> Iterator[
             last, left = now, (total - done) * (now - began) / max(done, 1)
             rest = f", {left:.0f} s left" if 0 < done < total else ""
             options = {"extra": FILE_ONLY} if task is not None and done < total and say == log.info else {}
-            say(f"{name}: {done} of {total}{f', {note}' if note else ''}{rest}", **options)
+            say(f"{name}: {done} of {total}{f': {note}' if note else ''}{rest}", **options)
 
     try:
         if task is not None:

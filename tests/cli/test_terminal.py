@@ -73,8 +73,8 @@ def test_work_under_way_has_a_name_and_the_time_left(caplog: pytest.LogCaptureFi
             report(Progress(done, 10, done))
     said = [record.getMessage() for record in caplog.records]
     assert said[0] == "test labels: 0 of 10"
-    assert said[1] == "test labels: 5 of 10, 5 converged, 0 failed, 0 s left"
-    assert said[2] == "test labels: 10 of 10, 10 converged, 0 failed"
+    assert said[1] == "test labels: 5 of 10: 5 converged, 0 failed, 0 s left"
+    assert said[2] == "test labels: 10 of 10: 10 converged, 0 failed"
 
 
 def test_a_signal_says_in_which_work_it_came() -> None:
