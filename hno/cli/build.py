@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from lightning.fabric.utilities.exceptions import MisconfigurationException
+from lightning.pytorch.callbacks import Callback
 from omegaconf import DictConfig
 
 from hno.cli.config import read
@@ -24,10 +25,12 @@ from hno.games.grid import parse_types
 from hno.losses import Objective, make_objective
 from hno.operators import Architecture, Choice, ValueOperator, make_operator
 from hno.training.adaptive import Adaptive
+from hno.training.callbacks import callbacks
 from hno.training.checkpoint import Draw, Provenance, check_resumable, record
-from hno.training.fit import Settings, make_trainer
+from hno.training.fit import Settings
 from hno.training.optimizers import make_optimizer
 from hno.training.quiet import quiet_lightning
+from hno.training.trainer import make_trainer
 
 
 class Built(NamedTuple):
@@ -70,7 +73,7 @@ def check(config: DictConfig) -> TrainSettings:
 def _check_device(settings: TrainSettings) -> None:
     try:
         with quiet_lightning():
-            make_trainer(how_to_train(settings), Path(), [], [])
+            make_trainer(how_to_train(settings), Path(), [], chosen_callbacks(settings))
     except (MisconfigurationException, TypeError, ImportError) as error:
         raise ValueError(f"trainer.accelerator, trainer.devices or trainer.precision: {error}") from error
 
@@ -139,14 +142,20 @@ def _collocation(settings: TrainSettings, *, supervised: bool) -> Collocation:
     return Collocation(make_sampler(settings.sampler), curriculum, data.interior_types)
 
 
+def chosen_callbacks(settings: TrainSettings) -> list[Callback]:
+    """The callbacks that the configuration chooses, by registered names."""
+    return [callbacks.get(name)(**options) for name, options in settings.callbacks.items()]
+
+
 def how_to_train(settings: TrainSettings) -> Settings:
     """How to train; entries of `trainer` have the names of the fields."""
-    shared = {name: value for name, value in settings.trainer if name in Settings.__dataclass_fields__}
+    shared = settings.trainer.model_dump(include=set(Settings.__dataclass_fields__) - {"lightning"})
     return Settings(
         steps=settings.trainer.max_steps,
         optimizer=settings.optimizer,
         stop_when_safe=settings.validation.stop_when_safe,
         dt=settings.validation.dt,
         adaptive=Adaptive(**settings.data.adaptive.model_dump()),
+        lightning=settings.trainer.lightning,
         **shared,
     )

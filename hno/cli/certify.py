@@ -14,7 +14,8 @@ from omegaconf import DictConfig
 from hno.cli.arguments import Arguments
 from hno.cli.config import configured, read
 from hno.cli.evaluate import Model, model, model_file
-from hno.cli.logs import label_progress, send_lightning_to_hydra, use_threads
+from hno.cli.logs import use_threads
+from hno.cli.progress import collect_messages, label_progress
 from hno.cli.results import versions, write_json
 from hno.cli.settings import CertifySettings
 from hno.control.exported import is_exported
@@ -35,7 +36,7 @@ def run(given: Arguments) -> int:
     """`hno certify`."""
     settings = configured("certify", check, given)
     if settings is not None:
-        send_lightning_to_hydra()
+        collect_messages()
         content = write(settings)
         print("\n".join([*content["text"], str(place_of(settings) / CERTIFICATE)]))
     return 0
@@ -122,9 +123,9 @@ def write(settings: CertifySettings) -> dict[str, Any]:
     use_threads(settings.threads)
     file, folder = model_file(settings.checkpoint), place_of(settings)
     policy = model(file, settings.expected_game)
-    report = label_progress(functools.partial(print, flush=True))
-    solve = functools.partial(solve_many, policy.game, workers=settings.workers, report=report)
-    found = certify(policy, plan_of(settings, policy.game), solve)
+    with label_progress("equilibria of tests", functools.partial(print, flush=True)) as report:
+        solve = functools.partial(solve_many, policy.game, workers=settings.workers, report=report)
+        found = certify(policy, plan_of(settings, policy.game), solve)
     content = {
         "checkpoint": Path(file).name,
         "sha256": _digest(Path(file)),

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 import importlib.util
 import inspect
 import os
 import re
 import sys
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoints, entry_points
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,18 @@ def config_dir() -> Path:
     return found
 
 
+@functools.lru_cache(maxsize=1)
+def _entry_points(path: tuple[str, ...]) -> Any:
+    """All of the process, which takes 20 ms and is asked for a hundred times."""
+    return entry_points()
+
+
+def offered(kind: str) -> EntryPoints:
+    """What installed packages offer of a kind; nothing is imported."""
+    found: EntryPoints = _entry_points(tuple(sys.path)).select(group=f"hno.{plural(kind)}")
+    return found
+
+
 class Folders(SearchPathPlugin):
     """Folders of configuration files besides our own: `conf` of packages that offer plugins, and --config-dir."""
 
@@ -50,13 +63,12 @@ class Folders(SearchPathPlugin):
     @classmethod
     def all(cls) -> list[Path]:
         """Every folder, ours first."""
-        every = entry_points()  # once: it reads what every installed package says
-        points = [point for kind in REGISTRIES for point in every.select(group=f"hno.{plural(kind)}")]
+        points = [point for kind in REGISTRIES for point in offered(kind)]
         packages = sorted({point.value.partition(":")[0].split(".")[0].strip() for point in points})
         specs = (importlib.util.find_spec(name) for name in packages if name.isidentifier())
         places = [Path(place) for spec in specs if spec for place in spec.submodule_search_locations or ()]
-        offered = [place / "conf" for place in places if (place / "conf").is_dir()]
-        return [config_dir(), *offered, *cls.own]
+        others = [place / "conf" for place in places if (place / "conf").is_dir()]
+        return [config_dir(), *others, *cls.own]
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
         """Hydra's hook."""
@@ -70,25 +82,19 @@ def groups(name: str) -> list[str]:
     return [str(group) for entry in defaults if OmegaConf.is_dict(entry) for group in entry]
 
 
-def choices(group: str, folders: Sequence[Path] | None = None) -> dict[str, Path | None]:
-    """Choices of a group and their files; those of plugins without a file have none. Nothing is imported.
-
-    Args:
-        group: of configurations.
-        folders: where files are; `Folders.all()` by default.
-    """
+def choices(group: str) -> dict[str, Path | None]:
+    """Choices of a group and their files; those of plugins without a file have none. Nothing is imported."""
     found: dict[str, Path | None] = {}
     if group in CHOSEN:
-        found = {point.name: None for point in entry_points(group=f"hno.{plural(group)}")}
-    files = (path for folder in folders or Folders.all() for path in (folder / group).glob("*.yaml"))
+        found = {point.name: None for point in offered(group)}
+    files = (path for folder in Folders.all() for path in (folder / group).glob("*.yaml"))
     return dict(sorted({**found, **{path.stem: path for path in files}}.items()))
 
 
 def register_plugins() -> None:
     """Make every registered name without a file a choice of its group, with its options and their defaults."""
-    folders = Folders.all()
     for group in CHOSEN:
-        registry, have = REGISTRIES[group](), choices(group, folders)
+        registry, have = REGISTRIES[group](), choices(group)
         for name in registry.names():
             if have.get(name) is None:
                 options = options_of(registry.get(name), skip=GIVEN.get(group, ()))

@@ -15,8 +15,9 @@ from omegaconf import DictConfig
 from hno.cli import launch
 from hno.cli.arguments import Arguments
 from hno.cli.config import read
-from hno.cli.logs import label_progress, use_threads
+from hno.cli.logs import use_threads
 from hno.cli.media import draw_typical
+from hno.cli.progress import label_progress, progress
 from hno.cli.results import Results, write_json
 from hno.cli.sections import chosen_sections, run_sections
 from hno.cli.settings import Episodes, EvaluateSettings
@@ -116,7 +117,8 @@ def describe(
         starts = min(options["starts"], TIES) if ties else options["starts"]
         kind = starts, options["seed"], "test", widen, symmetric, ties
         requests = [Request(theta, *kind) for theta in types]
-        return solver(game, requests, Path(cache or default_cache()), workers=workers, report=label_progress())[0]
+        with label_progress("test labels") as report:
+            return solver(game, requests, Path(cache or default_cache()), workers=workers, report=report)[0]
 
     return [
         Evaluation(name, policy, policy.types, types, options, lambda condition: solve(*condition.starts))
@@ -187,9 +189,12 @@ def play_starts(evaluation: Evaluation, results: Results) -> tuple[Evaluation, T
     began, game, folder = time.perf_counter(), evaluation.game, results.path.parent
     labels, disturbance = evaluation.solve(evaluation.condition), evaluation.condition.disturbance
     solved, played, kept = time.perf_counter(), list[Played](), list[dict[str, Any]]()
-    for label, paths in play(game, evaluation.policy, labels, evaluation.dt, disturbance):
-        played.append(numbers_of(game, label, paths))
-        kept += episodes(evaluation, label, paths)
+    with progress("evaluation") as update:
+        update(0, len(labels))
+        for label, paths in play(game, evaluation.policy, labels, evaluation.dt, disturbance):
+            played.append(numbers_of(game, label, paths))
+            kept += episodes(evaluation, label, paths)
+            update(len(played), len(labels))
     found = evaluation._replace(labels=labels, played=played)
     table = CollisionTable().compute(found)
     results.time("test_labels", solved - began)

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+import sys
+import textwrap
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
+from shutil import get_terminal_size
 from typing import Any
 
 import yaml  # type: ignore[import-untyped]  # yaml has no annotations
@@ -17,6 +20,26 @@ from hno.cli.schema import SettingsError
 
 BESIDE = 44
 """The column of comments."""
+ABOUT = {
+    "game": "the physics; its constructor's arguments are game.constants.<name>",
+    "operator": "the method: loss terms and their weights",
+    "function": "what is learned",
+    "network": "what the function is made of",
+    "activation": "of the network",
+    "data": "labels: types, how many, batches, phases of the training",
+    "sampler": "where collocation points lie",
+    "loss": "norm, scale and balance of the terms",
+    "optimizer": "how weights are found, and at which rate",
+    "trainer": "how long and on what; trainer.<argument> takes the others of lightning.Trainer, such as deterministic",
+    "logger": "where numbers go besides results.json",
+    "evaluation": "what is measured at the end",
+    "validation": "what is measured while training, and chooses the best checkpoint",
+    "callbacks": "of Lightning, by registered names; several as [a,b]",
+    "profiler": "where time goes",
+    "experiment": "a named recipe that sets several of these",
+    "debug": "a run that looks for a mistake; it is laid over all the others",
+}
+"""What every group is for."""
 
 
 def configuration_help(name: str, given: Arguments) -> str:
@@ -30,18 +53,16 @@ def configuration_help(name: str, given: Arguments) -> str:
     parts = []
     for group in groups(name):
         known = choices(group)
-        chosen = HydraConfig.get().runtime.choices.get(group)
+        chosen = _names(HydraConfig.get().runtime.choices.get(group))
         parts.append(_group(group, known, chosen))
-        path = known.get(str(chosen))
-        if path is not None:
-            text = path.read_text(encoding="utf-8")
-            prefix = "" if "@package _global_" in text else f"{group}."
-            said.update({prefix + key: comment for key, comment in comments(text)})
+        said[f"{group}.name"] = f"chosen by {group}=<name>"
+        for path in (known[one] for one in ("default", *chosen) if known.get(one) is not None):
+            said.update(_comments_of(path, group))
     head = "Groups, group=choice (*: chosen)\n" + "\n".join(parts) + "\n\n" if parts else ""
     text = yaml.dump(OmegaConf.to_container(config, resolve=False), Dumper=_Flow, sort_keys=False, width=10**6)
     lines = [(f"  {line}".replace(": ???", ": (required)"), key) for line, key in _keyed(text)]
     keys = [f"{line:<{BESIDE - 2}}  # {said[key]}" if key in said else line for line, key in lines]
-    return head + "Keys, key=value\n" + "\n".join(keys)
+    return head + "Keys, key=value\n" + "\n".join(_folded(line, " " * BESIDE + "# ") for line in keys)
 
 
 class _Flow(yaml.SafeDumper):  # type: ignore[misc]  # yaml has no annotations
@@ -54,13 +75,34 @@ class _Flow(yaml.SafeDumper):  # type: ignore[misc]  # yaml has no annotations
 _Flow.add_representer(list, _Flow.represent_list)
 
 
-def _group(group: str, known: Mapping[str, Path | None], chosen: object) -> str:
-    lines = []
-    for place, (choice, path) in enumerate(known.items()):
-        mark = "*" if choice == chosen else " "
-        text = f"  {'' if place else group:<12}{mark}{choice:<16}{'' if path is None else heading(path)}"
-        lines.append(text.rstrip())
-    return "\n".join(lines)
+def _names(chosen: Any) -> list[str]:
+    """Choices of a group: none, one, or several in a list."""
+    if OmegaConf.is_list(chosen) or isinstance(chosen, list):
+        return [str(one) for one in chosen]
+    return re.findall(r"\w+", str(chosen)) if chosen not in (None, "null") else []
+
+
+def _comments_of(path: Any, group: str) -> dict[str, str]:
+    """Comments of a file of a group, by the key in the whole configuration."""
+    text = Path(path).read_text(encoding="utf-8")
+    package = re.search(r"@package (\S+)", text)
+    place = package[1] if package else group
+    return {key if place == "_global_" else f"{place}.{key}": comment for key, comment in comments(text)}
+
+
+def _group(group: str, known: Mapping[str, Path | None], chosen: Collection[str]) -> str:
+    lines = [f"  {group}: {ABOUT[group]}"]
+    for choice, path in known.items():
+        mark = "*" if choice in chosen else " "
+        lines.append(f"    {mark} {choice:<16}{'' if path is None else heading(path)}".rstrip())
+    return "\n".join(_folded(line, " " * 22) for line in lines)
+
+
+def _folded(line: str, indent: str) -> str:
+    """A line as wide as the terminal, if there is one; what follows is indented."""
+    if not sys.stdout.isatty():
+        return line
+    return textwrap.fill(line, max(60, get_terminal_size().columns), subsequent_indent=indent, break_long_words=False)
 
 
 def comments(text: str) -> Iterator[tuple[str, str]]:

@@ -10,17 +10,17 @@ from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig
-from rich.console import Console
-from rich.table import Table
 
 from hno.cli.arguments import Arguments
 from hno.cli.config import configured, read
-from hno.cli.logs import label_progress, use_threads
+from hno.cli.logs import use_threads
+from hno.cli.progress import label_progress
 from hno.cli.settings import LabelSettings
+from hno.cli.tables import print_table, terminal
 from hno.data.certificates import GLOBAL_GAP, LOCAL_GAP, summary
 from hno.data.labels import Request, default_cache, label_set, labels_for
 from hno.data.store import LabelFileError
-from hno.games import Game, make
+from hno.games import make
 from hno.games.grid import parse_types
 from hno.processes import Interrupted
 from hno.types import Status
@@ -42,8 +42,8 @@ def run(given: Arguments) -> int:
         print(killed if isinstance(error, BrokenProcessPool) else error, file=sys.stderr)
         return 1
     except Interrupted as stop:
-        print(f"Interrupted by {stop}. Finished shards are kept: the same command goes on from here.", file=sys.stderr)
-        return stop.code
+        stop.add_note("Finished shards are kept: the same command goes on from here")
+        raise
     return 0
 
 
@@ -68,10 +68,12 @@ def generate(settings: LabelSettings) -> None:
         Request(theta, settings.n, settings.seed, settings.split, settings.widen, all_equilibria=every)
         for theta in parse_types(game, settings.theta, key="theta")
     ]
-    console, report = Console(), label_progress(functools.partial(print, flush=True))
-    found, seconds = labels_for(game, requests, cache, workers=settings.workers, report=report)
+    console = terminal()
+    with label_progress(say=functools.partial(print, flush=True)) as report:
+        found, seconds = labels_for(game, requests, cache, workers=settings.workers, report=report)
     rows = [summary(labels) for labels in found]
-    console.print(_table(game, requests, rows))
+    title = f"{type(game).__name__}, split {settings.split}, seed {settings.seed}"
+    print_table(console, COLUMNS, [_cells(*entry) for entry in zip(requests, rows, strict=True)], title)
     console.print(_total(rows), highlight=False)
     for status in Status:
         count = sum(row["status"][status.name.lower()] for row in rows)
@@ -94,13 +96,8 @@ def _total(rows: Sequence[dict[str, Any]]) -> str:
     )
 
 
-def _table(game: Game, requests: Sequence[Request], rows: Sequence[dict[str, Any]]) -> Table:
-    table = Table(title=f"{type(game).__name__}, split {requests[0].split}, seed {requests[0].seed}")
-    for name in COLUMNS:
-        table.add_column(name, justify="right")
-    for request, row in zip(requests, rows, strict=True):
-        worst = [row[f"largest_{name}"] for name in ("reintegration", "local_gap", "global_gap")]
-        cells = [row["status"]["converged"], f"{row['inevitable'] / row['starts']:.1%}", row["safe"]]
-        types = ", ".join(f"{t:g}" for t in request.theta)
-        table.add_row(types, str(row["starts"]), *map(str, cells), *("-" if w is None else f"{w:.0e}" for w in worst))
-    return table
+def _cells(request: Request, row: dict[str, Any]) -> list[str]:
+    worst = [row[f"largest_{name}"] for name in ("reintegration", "local_gap", "global_gap")]
+    counts = row["starts"], row["status"]["converged"], f"{row['inevitable'] / row['starts']:.1%}", row["safe"]
+    types = ", ".join(f"{t:g}" for t in request.theta)
+    return [types, *map(str, counts), *("-" if w is None else f"{w:.0e}" for w in worst)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import shlex
 import sys
 import tempfile
 import traceback
@@ -20,8 +21,10 @@ import hno
 from hno.cli import pages
 from hno.cli.arguments import Arguments, UsageError, one_screen, quoted
 from hno.cli.config import REFUSALS, configured, for_hydra, register_plugins, sentence, under_hydra
-from hno.cli.logs import finish_wandb, send_lightning_to_hydra
+from hno.cli.logs import finish_wandb
+from hno.cli.objective import Objective, objective
 from hno.cli.output import fresh, owned
+from hno.cli.progress import collect_messages
 from hno.cli.results import Results, recorded
 from hno.cli.schema import REGISTRIES
 from hno.cli.sections import show
@@ -72,16 +75,20 @@ def run(task: Task, given: Arguments) -> int:
         return 0  # a dry run
     began, succeeded = False, False
 
-    def job(config: DictConfig) -> None:
+    def job(config: DictConfig) -> Objective:
         nonlocal began, succeeded
         began = True
-        succeeded = perform(task, task.check(config), folder)
+        settings = task.check(config)
+        found = perform(task, settings, folder)
+        succeeded = found is not None
+        return objective(settings, found)
 
     register_plugins()
     try:
         folder = _chosen("hydra.run.dir", given, HydraConfig.get().run.dir)
         words = [*for_hydra(task.name, given), f"hydra.run.dir={quoted(str(folder))}"]
         with owned(folder, getattr(settings, "resume", None)):
+            print(f"Run: {folder}", flush=True)
             under_hydra(task.name, job, words)
     except Exception as error:
         if began:
@@ -117,6 +124,8 @@ def _multirun(task: Task, given: Arguments) -> int:
             folder = Path(nowhere) if dry else _chosen("hydra.sweep.dir", given, HydraConfig.get().sweep.dir)
             stack.enter_context(owned(folder, jobs=True))
             words = [*_here(words), *QUIET] if dry else words
+            if not dry:
+                print(f"Sweep: {folder}", flush=True)
             return _swept(task, ["--multirun", *words, f"hydra.sweep.dir={quoted(str(folder))}"], folder, dry)
     except REFUSALS as error:
         raise _refusal(error) from error
@@ -132,9 +141,9 @@ def _swept(task: Task, words: Sequence[str], folder: Path, dry: bool) -> int:
     failure = None
     with Ledger.within(folder) as ledger:
 
-        def job(config: DictConfig) -> None:  # a launcher may send it to another process
+        def job(config: DictConfig) -> Objective:  # a launcher may send it to another process
             follow(this)
-            _job(task, config, ledger, own, dry)
+            return _job(task, config, ledger, own, dry)
 
         try:
             with passed_on(ledger.pass_on):
@@ -148,7 +157,9 @@ def _swept(task: Task, words: Sequence[str], folder: Path, dry: bool) -> int:
             if found and not dry:
                 show_jobs([entry.job for entry in found])
         if ledger.signal is not None:
-            raise Interrupted(ledger.signal)
+            stop = Interrupted(ledger.signal)
+            stop.add_note(f"{counted(len(found), 'job')} had begun. Go on with each by: hno train resume=<its folder>")
+            raise stop
     refused = sum(not entry.succeeded for entry in found)
     if dry:
         print(counted(len(found), "job") + (f", {refused} refused" if refused else ""))
@@ -157,10 +168,10 @@ def _swept(task: Task, words: Sequence[str], folder: Path, dry: bool) -> int:
     return 1 if refused or failure is not None else 0
 
 
-def _job(task: Task, config: DictConfig, ledger: Ledger, own: Parts, dry: bool) -> None:
+def _job(task: Task, config: DictConfig, ledger: Ledger, own: Parts, dry: bool) -> Objective:
     """One job of a multirun, perhaps in another process, which is told what the user's own program registered."""
     if ledger.signal is not None:
-        return
+        return None
     for kind, parts in own.items():
         for name, part in parts.items():
             REGISTRIES[kind]().register(name)(part)
@@ -172,11 +183,13 @@ def _job(task: Task, config: DictConfig, ledger: Ledger, own: Parts, dry: bool) 
         settings = task.check(config)
     except Exception as error:
         print(f"   refused: {one_screen(sentence(error))}") if dry else _refuse(current, error)
-    else:
-        ledger.write(Entry(current, dry or _performed(task, settings, current, ledger)))
+        return None
+    found = None if dry else _performed(task, settings, current, ledger)
+    ledger.write(Entry(current, dry or found is not None))
+    return objective(settings, found)
 
 
-def _performed(task: Task, settings: Any, job: Job, ledger: Ledger) -> bool:
+def _performed(task: Task, settings: Any, job: Job, ledger: Ledger) -> Results | None:
     """Do a job in its folder; a signal ends the sweep, not only the job."""
     try:
         with interruptible(), owned(job.folder, getattr(settings, "resume", None)):
@@ -185,7 +198,7 @@ def _performed(task: Task, settings: Any, job: Job, ledger: Ledger) -> bool:
         ledger.stop(stop.number)
     except UsageError as error:
         log.error("%s", error)
-    return False
+    return None
 
 
 def _refuse(job: Job, error: Exception) -> None:
@@ -196,24 +209,28 @@ def _refuse(job: Job, error: Exception) -> None:
     log.error("%s", one_screen(sentence(error)))
 
 
-def perform(task: Task, settings: Any, folder: Path) -> bool:
+def perform(task: Task, settings: Any, folder: Path) -> Results | None:
     """Do one job; its folder gets results.json.
 
     Returns:
-        Whether it succeeded. A failure has been logged and is in the results.
+        What came of it; None where it failed, which has been logged and is in its folder.
     """
-    send_lightning_to_hydra()
+    collect_messages()
     results = Results(folder / "results.json", task.head(settings))
     try:
         with recorded(results):
             task.work(settings, results)
+    except Interrupted as stop:
+        if hasattr(settings, "resume"):
+            stop.add_note(f"Go on with: hno train resume={shlex.quote(str(folder))}")
+        raise
     except Exception as error:
         _log(error)
-        return False
+        return None
     finally:
         finish_wandb(results.content)
     show(results.content, folder)
-    return True
+    return results
 
 
 def _log(error: Exception) -> None:

@@ -11,11 +11,12 @@ from hno.cli.help import heading
 from hno.cli.schema import REGISTRIES
 from hno.registry import Description, plural, unknown_name
 
-KINDS = ("game", "method", "function", "network", "activation", "loss", "source", "optimizer")
+KINDS = ("game", "method", "function", "network", "activation", "loss", "source", "optimizer", "callback")
 ABOUT = {
     "method": "operator=NAME: loss terms and their weights",
     "function": "function=NAME: what is learned; auto is the potential where the game has one",
     "loss": "loss.terms.NAME={...} and loss.weights.NAME",
+    "callback": "callbacks.NAME={...}",
     "source": "sampler.NAME.share, of collocation points",
 }
 """How a kind is chosen, where it is not <kind>=NAME."""

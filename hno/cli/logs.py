@@ -1,42 +1,29 @@
-"""Loggers, progress and where messages go."""
+"""Loggers."""
 
 from __future__ import annotations
 
+import importlib.util
+import inspect
 import logging
-import math
 import os
+import shlex
 import socket
-import time
-import warnings
-from collections.abc import Callable, Mapping
+import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlparse
 
-import lightning as L
 import torch
-import wandb
-from lightning.pytorch.callbacks import RichProgressBar
 from lightning.pytorch.loggers import Logger, TensorBoardLogger, WandbLogger
 
 from hno.cli.curve import CurveLogger
 from hno.cli.settings import TrainSettings
-from hno.data.labels import Progress, Report
 from hno.report.runs import METRICS
 
 log = logging.getLogger(__name__)
 MODES = ("online", "offline", "disabled", "shared", "dryrun", "run")
 """What W&B takes for WANDB_MODE."""
-
-
-def send_lightning_to_hydra() -> None:
-    """Let Lightning's messages and Python's warnings reach Hydra's handlers, console and file."""
-    logging.captureWarnings(True)
-    warnings.formatwarning = lambda message, category, *_, **__: f"{category.__name__}: {message}"
-    for name in ("lightning", "lightning.pytorch", "lightning.fabric"):
-        logger = logging.getLogger(name)
-        logger.handlers.clear()
-        logger.propagate = True
 
 
 def use_threads(count: int | None) -> None:
@@ -62,18 +49,28 @@ def loggers(settings: TrainSettings, folder: Path, first: int = 0) -> list[Logge
             except ModuleNotFoundError as error:
                 message = "TensorBoard is not installed: `pip install tensorboard`, or choose logger=csv."
                 raise RuntimeError(message) from error
+        elif importlib.util.find_spec("wandb") is None:
+            log.info("W&B is not installed: metrics go to %s alone. `pip install wandb` adds it.", METRICS)
         elif (mode := wandb_mode(settings.logger.mode)) != "disabled":
             made.append(_wandb(settings, folder, mode))
-    return made
+        else:
+            log.info("W&B is switched off: metrics go to %s alone.", METRICS)
+    return made or [CurveLogger(folder / METRICS, first)]
 
 
 def _wandb(settings: TrainSettings, folder: Path, mode: str) -> Logger:
     """The run of the folder, if W&B left one there: it ends the names of its own folders with the run's id."""
+    os.environ.setdefault("WANDB_SILENT", "true")  # what it says is in its files, and here where those are
     known = sorted(folder.glob("wandb/*run-*-*"))
-    return WandbLogger(
+    logger = WandbLogger(
         name=folder.name, save_dir=folder, mode=mode, project=settings.logger.project, group=folder.parent.name,
         config=settings.model_dump(), id=known[-1].name.rpartition("-")[2] if known else None, resume="allow",
+        job_type="train", tags=settings.tags or None, notes=settings.notes,
     )  # fmt: skip
+    run = logger.experiment
+    here = shlex.quote(str(Path(run.dir).parent))
+    log.info("W&B run: %s", run.url if mode == "online" else f"{here}; `wandb sync` uploads it.")
+    return logger
 
 
 def finish_wandb(results: Mapping[str, Any]) -> None:
@@ -82,8 +79,10 @@ def finish_wandb(results: Mapping[str, Any]) -> None:
     Args:
         results: content of results.json.
     """
-    if wandb.run is not None:
-        wandb.run.summary.update({name: results[name] for name in ("status", "reason")})
+    wandb = sys.modules.get("wandb")  # of a logger that used it
+    if wandb is None or wandb.run is None:
+        return
+    wandb.run.summary.update({name: results[name] for name in ("status", "reason")})
     wandb.finish(exit_code=int(results["status"] != "finished"))
 
 
@@ -107,7 +106,11 @@ def wandb_mode(choice: str) -> str:
         ValueError: "online" without a key.
     """
     choice = os.environ.get("WANDB_MODE", choice) if choice == "auto" else choice
-    has_key, server = bool(os.environ.get("WANDB_API_KEY") or wandb.api.api_key), wandb.Settings().base_url
+    if choice == "disabled":
+        return choice
+    import wandb
+
+    has_key, server = _has_key(), wandb.Settings().base_url
     if choice == "online" and not has_key:
         raise ValueError("W&B has no API key to run online: `wandb login`, set WANDB_API_KEY, or use logger.mode=auto.")
     if choice != "auto":
@@ -121,6 +124,17 @@ def wandb_mode(choice: str) -> str:
     return "offline"
 
 
+def _has_key() -> bool:
+    """Whether W&B knows a key, without asking for one."""
+    import wandb
+
+    if os.environ.get("WANDB_API_KEY"):
+        return True
+    if "prompt" in inspect.signature(wandb.login).parameters:
+        return bool(wandb.login(prompt=False, verify=False))
+    return bool(wandb.api.api_key)  # before 0.2x
+
+
 def _reachable(url: str) -> bool:
     parts = urlparse(url)
     try:
@@ -128,54 +142,3 @@ def _reachable(url: str) -> bool:
             return True
     except OSError:
         return False
-
-
-def label_progress(say: Callable[[str], None] = log.info, every: float = 10.0) -> Report:
-    """A function that says how many labels are solved, at most one line every so many seconds."""
-    began = last = time.monotonic()
-
-    def report(progress: Progress) -> None:
-        nonlocal last
-        now, left = time.monotonic(), progress.total - progress.done
-        if now - last >= every or not left:
-            last = now
-            counts = f"{progress.converged} converged, {progress.done - progress.converged} failed"
-            rate = progress.done / max(now - began, 1e-9)
-            seconds = left / max(rate, 1e-9)
-            say(f"labels: {progress.done} of {progress.total}: {counts}, {rate:.1f}/s, {seconds:.0f} s left")
-
-    return report
-
-
-class StepBar(RichProgressBar):
-    """A live bar over the steps of the run; epochs mean nothing here."""
-
-    @property
-    def total_train_batches(self) -> int:
-        """Steps of the run."""
-        return self.trainer.max_steps
-
-    def _get_train_description(self, current_epoch: int) -> str:
-        return "training"
-
-    def get_metrics(self, *run: Any) -> dict[str, Any]:
-        """Losses, without the logger's version."""
-        return {name: value for name, value in super().get_metrics(*run).items() if name != "v_num"}
-
-
-class StepLines(L.Callback):
-    """One line every so many steps, where there is no terminal.
-
-    Args:
-        every: steps between lines.
-    """
-
-    def __init__(self, every: int) -> None:
-        self.every = every
-
-    def on_train_batch_end(self, trainer: L.Trainer, *others: Any) -> None:
-        """Print the losses."""
-        if trainer.global_step % self.every == 0:
-            found = [(name, float(value)) for name, value in sorted(trainer.callback_metrics.items())]
-            losses = ", ".join(f"{k} {v:.4g}" for k, v in found if k == "loss/total" or not math.isnan(v))
-            log.info("step %d of %d: %s", trainer.global_step, trainer.max_steps, losses)

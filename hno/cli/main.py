@@ -75,8 +75,8 @@ COMMANDS = {
     ),
     "list": Command(
         "hno.cli.listing:run", "[KIND ...]",
-        "List what is registered: games, methods, networks, activations, losses, sources and optimizers, each with the "
-        "package that it comes from.",
+        "List what is registered: games, methods, networks, activations, losses, sources, optimizers and callbacks, "
+        "each with the package that it comes from.",
     ),
     "new-game": Command(
         "hno.cli.new_game:run", "NAME [--to FOLDER]",
@@ -117,7 +117,7 @@ def main(given: Sequence[str] | None = None, prog: str | None = None) -> int:
         print(one_screen(str(error)), file=sys.stderr)
         return 2 if isinstance(error, UsageError) else 1
     except Interrupted as stop:
-        print(f"Interrupted by {stop}.", file=sys.stderr)
+        print(". ".join([f"Interrupted by {stop}", *getattr(stop, "__notes__", [])]) + ".", file=sys.stderr)
         return stop.code
     except KeyboardInterrupt:  # of a program that calls this in a thread
         print("Interrupted.", file=sys.stderr)

@@ -6,8 +6,8 @@ import json
 import math
 import platform
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from importlib.metadata import version
+from contextlib import contextmanager, suppress
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,11 @@ PACKAGES = ("torch", "lightning", "torchmetrics", "hydra-core", "omegaconf", "wa
 
 def versions() -> dict[str, str]:
     """Versions of hno, Python and the packages that numbers depend on."""
-    return {"hno": hno.__version__, "python": platform.python_version(), **{name: version(name) for name in PACKAGES}}
+    found = {"hno": hno.__version__, "python": platform.python_version()}
+    for name in PACKAGES:
+        with suppress(PackageNotFoundError):  # W&B may be absent
+            found[name] = version(name)
+    return found
 
 
 def finite(content: Any) -> Any:

@@ -24,10 +24,12 @@ from hno.report.runs import METRICS, RESULTS
 from hno.training.checkpoint import find_checkpoint, flat, same_run
 from hno.training.saving import BEST, LAST, RESUMED, read_content
 
+WATCHING = ("profiler", "detect_anomaly", "enable_model_summary", "log_every_n_steps", "max_time")
+"""Entries of `trainer` that watch the steps or end them."""
 FREE: dict[str, Any] = {
-    **dict.fromkeys(("logger", "evaluation", "resume"), True),
+    **dict.fromkeys(("logger", "evaluation", "resume", "objective", "tags", "notes", "callbacks"), True),
     "data": {"cache", "workers"},
-    "trainer": {"max_steps", "accelerator", "devices", "print_every", "threads"},
+    "trainer": {"max_steps", "accelerator", "devices", "print_every", "threads", "strategy", *WATCHING},
     "validation": {"stop_when_safe"},
 }
 """What a training does not depend on: it may be different in a run that goes on."""

@@ -101,6 +101,7 @@ REGISTRIES: Mapping[str, Callable[[], Registry[Any]]] = {
         "loss": "hno.losses:losses",
         "source": "hno.data.sources:sources",
         "optimizer": "hno.training.optimizers:optimizers",
+        "callback": "hno.training.callbacks:callbacks",
     }.items()
 }
 """The registry of every kind, as a function that imports it."""
@@ -175,6 +176,7 @@ Network = Annotated[dict[str, Any], _part("network")]
 Activation = Annotated[dict[str, Any], _part("activation")]
 Optimizer = Annotated[dict[str, Any], _part("optimizer", SCHEDULE)]
 Sampler = Annotated[dict[str, Any], _several("source", {"share": (Amount, ...)})]
+Callbacks = Annotated[dict[str, Any], _several("callback")]
 Terms = Annotated[dict[str, Any], _several("loss")]
 Weights = Annotated[
     dict[str, Amount | None], AfterValidator(lambda found: {k: v for k, v in found.items() if v is not None})

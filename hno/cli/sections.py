@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.table import Table
 
+from hno.cli.progress import progress
 from hno.cli.results import Results
+from hno.cli.tables import print_table, terminal
 from hno.evaluation.format import short_names, title
 from hno.evaluation.sections import Evaluation, ModelSection, sections
-
-WIDTH = 140
-"""Columns of text where there is no terminal to ask."""
 
 
 def chosen_sections(options: Mapping[str, Any]) -> dict[str, ModelSection]:
@@ -29,7 +26,8 @@ def run_sections(evaluation: Evaluation, results: Results) -> Iterator[tuple[str
     """Name and content of every section that is asked for, one after the other."""
     for name, section in chosen_sections(evaluation.options).items():
         began = time.perf_counter()
-        content = section.compute(evaluation)
+        with progress(name.replace("_", " ")):
+            content = section.compute(evaluation)
         results.time(name, time.perf_counter() - began)
         yield name, content
 
@@ -47,18 +45,16 @@ def show_section(name: str, content: Any, results: Mapping[str, Any], console: C
     section = sections.get(name)()
     rows = section.rows(content)
     if rows:
-        titles = (column.title for column in section.columns)
-        table = Table(*titles, title=title or section.heading, caption=section.note or None)
-        for row in rows:
-            table.add_row(*(column.format(row[column.name]) for column in section.columns))
-        console.print(table)
+        titles = [column.title for column in section.columns]
+        cells = [[column.format(row[column.name]) for column in section.columns] for row in rows]
+        print_table(console, titles, cells, title or section.heading, section.note)
     for remark in section.remarks(content, results):
         console.print(remark, soft_wrap=True)
 
 
 def show(results: Mapping[str, Any], folder: Path) -> None:
     """Print the sections of every model, the comparison of models and where everything lies."""
-    console = Console(width=None if sys.stdout.isatty() else WIDTH)
+    console = terminal()
     models = results.get("models", [results])
     names = short_names([str(model["checkpoint"]) for model in models]) if len(models) > 1 else [""]
     for name, model in zip(names, models, strict=True):

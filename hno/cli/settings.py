@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 
 from hno.cli import schema
 from hno.cli.schema import Amount, Count, Loose, Place, Positive, Probability, Seed, Settings, Share, Size, Text
+
+Objective = Text | Annotated[list[Text], Field(min_length=1)]
+"""Names of numbers that a job returns to its sweeper."""
 
 
 class GameSettings(Settings):
@@ -79,7 +82,9 @@ class LossSettings(Settings):
 
 
 class TrainerSettings(Settings):
-    """How long and on what."""
+    """How long and on what; besides these, every argument of Lightning's trainer that a training does not decide."""
+
+    model_config = ConfigDict(extra="allow")
 
     max_steps: Size
     schedule_steps: Size | None
@@ -92,6 +97,23 @@ class TrainerSettings(Settings):
     validate_every: Size
     print_every: Size
     threads: Size | None
+    strategy: Text = "auto"
+    profiler: Literal["simple", "advanced", "pytorch"] | None = None
+
+    @model_validator(mode="after")
+    def _arguments(self) -> Self:
+        from hno.training.trainer import check_arguments  # not at the top: help and completion do without torch
+
+        try:
+            check_arguments(self.lightning, list(type(self).model_fields))
+        except (LookupError, ValueError) as error:
+            raise schema.SettingsError(str(error)) from error
+        return self
+
+    @property
+    def lightning(self) -> dict[str, Any]:
+        """Further arguments of Lightning's trainer."""
+        return self.model_extra or {}
 
 
 class LoggerSettings(Settings):
@@ -150,8 +172,12 @@ class TrainSettings(Settings):
     logger: LoggerSettings
     evaluation: EvaluationSettings
     validation: ValidationSettings
+    callbacks: schema.Callbacks = Field(default_factory=dict)
     seed: Seed
     resume: Place | None
+    objective: Objective = "best/collision_rate"
+    tags: list[Text] = Field(default_factory=list)
+    notes: str | None = None
 
 
 class EvaluateSettings(Episodes):
@@ -172,6 +198,7 @@ class EvaluateSettings(Episodes):
     cache: Place | None
     workers: Size | None
     threads: Size | None
+    objective: Objective = "test/collision_rate"
 
 
 class LabelSettings(Settings):

@@ -7,7 +7,6 @@ import os
 import platform
 import shlex
 import signal
-import sys
 import tempfile
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -16,12 +15,10 @@ from typing import Any, NamedTuple
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
-from rich.box import SIMPLE_HEAD
-from rich.console import Console
-from rich.table import Table
 
 from hno.cli import pages
 from hno.cli.results import write_json
+from hno.cli.tables import print_table, terminal
 from hno.data.store import replace_whole
 from hno.evaluation.format import NAMES, counted, interval, percent, signed, types
 from hno.evaluation.outcome import pooled
@@ -29,10 +26,6 @@ from hno.report.runs import LOST, at_work
 
 NAMED = (*NAMES, "seed")
 """Entries of results.json that name a job, in the order by which jobs are sorted."""
-WRAPPED = ("settings", "95 % interval", "worst type")
-"""Columns that take several lines where the terminal is narrow."""
-WIDTH = 160
-"""Columns of text where there is no terminal to ask."""
 CAPTION = (
     "collisions of safe starts over all types; excess cost: above the equilibrium's joint cost, the median over starts "
     "and types"
@@ -135,20 +128,13 @@ def show_jobs(jobs: Sequence[Job]) -> None:
     found = sorted(((job, job.results()) for job in jobs), key=_order)
     rows = [_cells(job, results, shared) for job, results in found]
     shown = [name for name in rows[0] if name != "settings" or any(row["settings"] for row in rows)]
-    table = Table(
-        title=counted(len(jobs), "job"), caption=CAPTION, box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False
-    )
-    for name in shown:
-        table.add_column(name, no_wrap=name not in WRAPPED)
-    for row in rows:
-        table.add_row(*(row[name] for name in shown))
     failures = [
         f"Job {job.number} {results['status']}: {' '.join(str(results['reason']).split())}"
         for job, results in found
         if results["status"] != "finished"
     ]
-    console = Console(width=None if sys.stdout.isatty() else WIDTH)
-    console.print(table)
+    console = terminal()
+    print_table(console, shown, [[row[name] for name in shown] for row in rows], counted(len(jobs), "job"), CAPTION)
     folder, in_haste = jobs[0].folder.parent, any(results["status"] == "interrupted" for _, results in found)
     page = f"Page: hno report {shlex.quote(str(folder))}" if in_haste else pages.write(folder)
     for line in (*failures, page):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +10,12 @@ import lightning as L
 
 from hno.cli import launch, pages
 from hno.cli.arguments import Arguments
-from hno.cli.build import build, check, how_to_train, record_of
+from hno.cli.build import build, check, chosen_callbacks, how_to_train, record_of
 from hno.cli.config import configured
 from hno.cli.evaluate import describe, play_starts, unseen_types
-from hno.cli.logs import StepBar, StepLines, label_progress, loggers, use_threads
+from hno.cli.logs import loggers, use_threads
 from hno.cli.media import publish
+from hno.cli.progress import StepLines, label_progress, progress
 from hno.cli.results import Results
 from hno.cli.resume import finished, history, in_its_folder, run_folder, take_over, training_hash
 from hno.cli.sections import run_sections, show
@@ -82,20 +82,22 @@ def train_operator(settings: TrainSettings, folder: Path, results: Results) -> F
     """Solve labels and train; the folder gets `last.ckpt` and `best.ckpt`, the results how it went and which to use."""
     L.seed_everything(settings.seed, verbose=False)
     use_threads(settings.trainer.threads)
-    built = build(settings, label_progress())
-    _, operator, objective, data = built
     resume, (*_, now) = take_over(settings.resume, folder), results.content.get("resumed", [{"step": 0}])
     makers = loggers(settings, folder, now["step"])
-    data.setup("fit")
+    with label_progress() as report:
+        built = build(settings, report)
+        _, operator, objective, data = built
+        data.setup("fit")
     results.time("labels", data.label_seconds)
     results.update(label_statistics=summaries(data.extremals))
     first, later = validation_starts(settings, data, results)
-    bar = StepBar() if sys.stdout.isatty() else StepLines(settings.trainer.print_every)
     try:
-        fitted = fit(
-            operator, objective, data, how_to_train(settings), folder, validation=first, later=later,
-            record=record_of(settings, built), loggers=makers, callbacks=[bar], resume=resume,
-        )  # fmt: skip
+        with progress("training", None) as update:
+            fitted = fit(
+                operator, objective, data, how_to_train(settings), folder, validation=first, later=later,
+                record=record_of(settings, built), loggers=makers, resume=resume,
+                callbacks=[*chosen_callbacks(settings), StepLines(settings.trainer.print_every, update)],
+            )  # fmt: skip
     except DivergedError:
         if (folder / BEST).exists():
             results.update(checkpoint=BEST)
@@ -126,7 +128,8 @@ def validation_starts(settings: TrainSettings, data: GameData, results: Results)
     def solve(starts: int) -> list[Extremal]:
         requests = [Request(theta, starts, choice.seed, "validation") for theta in types]
         log.info("labels of %d safe validation starts at each of %d types", starts, len(types))
-        found, seconds = safe_labels_for(data.game, requests, cache, workers, label_progress(), clearance=clearance)
+        with label_progress("validation labels") as report:
+            found, seconds = safe_labels_for(data.game, requests, cache, workers, report, clearance=clearance)
         results.time("validation_labels", seconds)
         return safe_sets(found, clearance)
 

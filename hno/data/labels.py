@@ -68,7 +68,7 @@ class Progress(NamedTuple):
 
 
 Report = Callable[[Progress], None]
-"""Called when labels have been written."""
+"""Called before the first label is solved, and when labels have been written."""
 
 
 def default_cache() -> Path:
@@ -158,7 +158,7 @@ def labels_for(
         cache: folder of label sets.
         settings: solver settings, part of the cache key.
         workers: processes with one thread each; as many as the job has cores by default.
-        report: called as labels are written.
+        report: called before the first and as labels are written.
 
     Returns:
         One `Extremal` per request, failed rows included, read when it is asked for; the seconds spent on solving.
@@ -173,6 +173,8 @@ def labels_for(
     total, done, converged = sum(len(job.x0) - job.have for job in jobs), 0, 0
     if jobs:
         check_room(cache, label_bytes(game, total), f"Labels of {total} start states", "choose another with $HNO_CACHE")
+    if jobs and report is not None:
+        report(Progress(0, total, 0))
     with closing(_run(game, jobs, settings, workers)) as solved:  # whatever ends this ends the workers
         for status in solved:
             done += len(status)

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import lightning as L
-from lightning.pytorch.callbacks import ModelCheckpoint, ProgressBar
 from lightning.pytorch.loggers import Logger
 
 from hno.data import GameData
@@ -20,14 +19,14 @@ from hno.operators import ValueOperator
 from hno.processes import stop_if_asked, waiting_signals
 from hno.training.adaptive import Adaptive, AdaptiveLabels, Round
 from hno.training.checkpoint import check_training_state, same_run
-from hno.training.divergence import StopOnDivergence
 from hno.training.interruption import SaveOnSignal
 from hno.training.logbook import Logbook
 from hno.training.module import TrainingModule
 from hno.training.optimizers import make_optimizer
 from hno.training.polish import Polish
 from hno.training.quiet import quiet_lightning
-from hno.training.saving import BEST, LAST, UNFIT, CheckpointError, CheckpointFiles, read_content, reason, remove_drafts
+from hno.training.saving import BEST, LAST, UNFIT, CheckpointError, read_content, reason, remove_drafts
+from hno.training.trainer import make_trainer
 from hno.training.validation import ClosedLoopValidation, Later, Score
 from hno.types import Extremal
 
@@ -61,6 +60,12 @@ class Settings:
     precision: Any = "32-true"
     """One of `PRECISIONS`."""
     gradient_clip_val: float | None = None
+    strategy: str = "auto"
+    """"auto" or "single_device"."""
+    profiler: str | None = None
+    """"simple", "advanced" or "pytorch"; it writes into the folder."""
+    lightning: Mapping[str, Any] = field(default_factory=dict)
+    """Further arguments of Lightning's trainer, see `hno.training.trainer.CONTROLLED` for those that are none."""
     polish: int = 0
     """Iterations of L-BFGS on all labelled rows after the last step."""
     adaptive: Adaptive = field(default_factory=Adaptive)
@@ -190,43 +195,3 @@ def _check_room(folder: Path, operator: ValueOperator) -> None:
     """Refuse a folder without room for the checkpoints: weights and two moments, and a draft beside those kept."""
     weights = sum(parameter.nbytes for parameter in operator.parameters())
     check_room(folder, 3 * 3 * weights, "Checkpoints", "choose another folder")
-
-
-def make_trainer(
-    settings: Settings, folder: Path, loggers: Sequence[Logger], callbacks: Sequence[L.Callback]
-) -> L.Trainer:
-    """A trainer that runs for a number of steps and leaves `last.ckpt`, of what is validated every so often.
-
-    Raises:
-        ValueError: there is no such accelerator or precision, or there are several devices.
-    """
-    every, files = settings.validate_every, CheckpointFiles()
-    # After a validation, when the step is over and in the curves: what goes on from there lacks and repeats nothing.
-    keeping_last = ModelCheckpoint(
-        folder, Path(LAST).stem, every_n_epochs=1, save_on_train_epoch_end=False, enable_version_counter=False
-    )
-    trainer = L.Trainer(
-        accelerator=settings.accelerator,
-        devices=settings.devices,
-        precision=settings.precision,
-        max_steps=settings.steps,
-        max_epochs=-1,
-        gradient_clip_val=settings.gradient_clip_val,
-        val_check_interval=every,
-        check_val_every_n_epoch=None,
-        num_sanity_val_steps=0,
-        log_every_n_steps=max(1, min(50, settings.planned)),
-        logger=list(loggers) or False,
-        callbacks=[StopOnDivergence(folder, files), *callbacks, keeping_last],
-        plugins=[files],
-        enable_progress_bar=any(isinstance(callback, ProgressBar) for callback in callbacks),
-        enable_model_summary=False,
-        default_root_dir=folder,
-        inference_mode=False,
-    )
-    if trainer.world_size > 1:
-        raise ValueError(
-            f"trainer.devices={settings.devices} asks for {trainer.world_size} devices; a run trains on one. Choose it "
-            "with trainer.devices=1 or its number, [1], and put several devices to use with one run on each."
-        )
-    return trainer

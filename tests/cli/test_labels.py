@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import functools
+import re
 import sys
 from collections.abc import Callable
 from concurrent.futures.process import BrokenProcessPool
@@ -64,10 +65,10 @@ def sets(folder: Path, **changes: object) -> list[Path]:
     return [label_set(make("narrow_road"), request, folder).folder for request in requests]
 
 
-def cells(out: str, theta: str) -> list[str]:
-    """The cells of a type's line of the table."""
-    (line,) = [line for line in out.splitlines() if theta in line]
-    return [cell.strip() for cell in line.strip("│").split("│")]
+def cells(printed: str, theta: str) -> list[str]:
+    """The cells of a type's line in the table."""
+    lines = [re.split(r"\s{2,}", line.strip()) for line in printed.splitlines()]
+    return next((line for line in lines if line[0] == theta), [])
 
 
 def test_table_has_a_line_per_type(generate: Generate, folder: Path) -> None:
