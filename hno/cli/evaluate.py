@@ -30,6 +30,7 @@ from hno.evaluation.episodes import EPISODES, episodes, together
 from hno.evaluation.format import title
 from hno.evaluation.outcome import Played, numbers_of
 from hno.evaluation.sections import Evaluation
+from hno.evaluation.starts import OUTCOMES, starts_of
 from hno.games import Game
 from hno.games.grid import parse_types, quarter_types
 from hno.runtime import ArtefactError
@@ -195,11 +196,12 @@ def play_starts(evaluation: Evaluation, results: Results) -> tuple[Evaluation, T
     results.time("test_labels", solved - began)
     results.time("evaluation", time.perf_counter() - solved)
     if results.content["episodes"] is None:
+        write_json(folder / OUTCOMES, {"types": starts_of(found)})
         write_json(folder / EPISODES, together(game, kept))
         conditions = {name: found.options[name] for name in ("clearance", "dt", "widen", "noise", "delay")}
         conditions["learns"] = found.options.get("learns")  # what no run has while it trains
         results.update(**conditions, test_seed=disturbance.seed, constraint_unit=game.constraint_unit)
-        results.update(table=table, episodes=EPISODES)
+        results.update(table=table, episodes=EPISODES, outcomes=OUTCOMES)
         draw_typical(kept, folder / "rollout.png", title(results.content))
     return found, table
 

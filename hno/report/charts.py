@@ -86,13 +86,16 @@ def comparison(data: Any) -> Layers:
 
 
 def learning_curves(data: Any, scale: Literal["log", "linear"]) -> Layers:
-    """A metric over training steps, one line for every run, from rows with step, value, run and recipe."""
+    """A metric over training steps, one line for every run, from rows with step, value, run and recipe.
+
+    Its signal "metric" is the name above the vertical axis, with a unit if it has one.
+    """
     values = alt.Scale(type=scale, zero=False, nice=False)
     base = (
         alt.Chart(data)
         .transform_calculate(tip="datum.run + '\\nstep ' + datum.step + ': ' + datum.value")
         .encode(
-            x=alt.X("step:Q", title="step", axis=alt.Axis(grid=False, tickCount=5)),
+            x=alt.X("step:Q", title="training step", axis=alt.Axis(grid=False, tickCount=5)),
             y=alt.Y("value:Q", title=None, scale=values, axis=alt.Axis(format="~g", tickCount=4, grid=False)),
             color=alt.Color("recipe:N", legend=alt.Legend(title=None, orient="bottom", columns=2, labelLimit=260)),
             detail="run:N",
@@ -100,7 +103,14 @@ def learning_curves(data: Any, scale: Literal["log", "linear"]) -> Layers:
     )
     lines = base.mark_line(strokeWidth=1.4, opacity=0.75, interpolate="linear")
     points = base.mark_circle(size=60, opacity=0).encode(tooltip="tip:N")
-    return alt.layer(lines, points).properties(width="container", height=200)
+    name = alt.TitleParams(
+        alt.expr("metric"), anchor="start", fontSize=11, fontWeight="normal", color=alt.expr("muted")
+    )
+    return (
+        alt.layer(lines, points)
+        .properties(width="container", height=200, title=name)
+        .add_params(*colors(), alt.param(name="metric", value=""))
+    )
 
 
 def encounter(

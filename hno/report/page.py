@@ -65,7 +65,7 @@ def render(sweep: Sweep, refresh: float | None = None) -> str:
     )  # fmt: skip
     environment.globals |= {"format": text, "verdicts": verdicts, "names_of": names_of, "type_table": type_table}
     return environment.get_template("page.html.j2").render(
-        sweep=sweep, recipes=found, games={game: (headline(own), own) for game, own in games.items()}, cards=cards,
+        sweep=sweep, recipes=found, single=len(runs) == 1, games={game: (headline(own), own) for game, own in games.items()}, cards=cards,
         unfinished=[run for run in runs if not run.finished], filters={name: _choices(runs, name) for name in FILTERS},
         curve_games=sorted({entry["game"] for entry in curves}), recipe_table=recipe_table(found),
         run_table=run_table(runs), labels=label_tables(runs), sections=[entry for entry in sections if entry[1]],

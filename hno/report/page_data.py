@@ -51,16 +51,16 @@ def _rates(recipe: Recipe) -> list[Row]:
 
 
 def learning_curves(recipes: Iterable[Recipe], runs: Iterable[Run]) -> list[Row]:
-    """Metrics of every run by step, thinned out evenly."""
+    """Metrics of every run by step, thinned out evenly; what was logged once is no curve."""
     names = {run.name: recipe.name for recipe in recipes for run in recipe.runs}
     return [
         {
             **names_of(run), "run": run.name,
             "recipe": names.get(run.name, " / ".join((run.operator, run.function, run.activation))),
-            "metrics": {name: _thinned(curve) for name, curve in sorted(run.curves.items())},
+            "metrics": {name: _thinned(curve) for name, curve in sorted(run.curves.items()) if len(curve) > 1},
         }
         for run in runs
-        if run.curves
+        if any(len(curve) > 1 for curve in run.curves.values())
     ]  # fmt: skip
 
 

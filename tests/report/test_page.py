@@ -100,7 +100,7 @@ def test_nothing_from_a_file_becomes_markup(tmp_path, small_page):
     }  # fmt: skip
     folder = write_run(tmp_path / "0", {**results, "game": HOSTILE})
     metrics = folder / "csv" / "metrics.csv"
-    metrics.write_text(f'"{HOSTILE.replace(chr(34), chr(34) * 2)}",step\n1,2\n')
+    metrics.write_text(f'"{HOSTILE.replace(chr(34), chr(34) * 2)}",step\n1,2\n2,4\n')
     write_run(tmp_path / "1", {**results, "seed": 1, "status": "failed", "reason": HOSTILE, "operator": "sno"})
     hostile = render(load(tmp_path))
     count = [len(re.findall(r"<script", text.split('id="data">')[0])) for text in (hostile, small_page)]

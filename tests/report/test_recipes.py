@@ -167,17 +167,16 @@ def test_failed_and_unfinished_runs_are_told_but_not_counted(tmp_path):
     assert (rate(recipe), recipe.failed, recipe.unfinished) == ((1, 200), 1, 1)
 
 
-def recipe_names(found: Sequence[Recipe]) -> list[str]:
-    return [recipe.operator for recipe in found]
-
-
 def test_the_best_has_the_lowest_rate_and_names_its_rivals(tmp_path):
     for operator, collisions in (("sno", (0, 1)), ("hno", (0, 2)), ("other", (40, 60))):
         write(tmp_path / operator, 0, collisions, operator=operator)
     found = recipes(loaded(tmp_path))
     (chosen,) = best(found)
     assert chosen.operator == "sno"
-    assert recipe_names(rivals(chosen, found)) == ["hno"]
+    assert [(one.recipe.operator, one.told_apart) for one in rivals(chosen, found)] == [
+        ("hno", False),
+        ("other", True),
+    ]
 
 
 def test_other_conditions_of_play_are_not_compared(tmp_path):

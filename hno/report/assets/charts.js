@@ -60,8 +60,23 @@ function drawCurves(host) {
   const points = told.flatMap(({ run, recipe, metrics }) =>
     metrics[metric].map(([step, value]) => ({ run, recipe, step, value })),
   );
-  const scale = points.length && points.every((point) => point.value > 0) ? "log" : "linear";
-  draw(host, scale, { points }, {}, "canvas");
+  host.closest("figure").hidden = !points.length;
+  if (!points.length) return;
+  const scale = points.every((point) => point.value > 0) ? "log" : "linear";
+  draw(host, scale, { points }, { metric: `${metric}, ${meaning(metric)}${scale === "log" ? ", log scale" : ""}` }, "canvas");
+}
+
+/** What a metric's numbers are, by the beginning of its name. */
+function meaning(metric) {
+  const known = [
+    ["seconds/", "s"],
+    ["closed_loop/collision_rate", "collisions per safe start"],
+    ["closed_loop/excess", "joint cost above the equilibrium's, share of it"],
+    ["val/", "error on held-out labels, share of their size"],
+    ["lr", "learning rate"],
+    ["loss/", "training loss, weighted, no unit"],
+  ];
+  return (known.find(([start]) => metric.startsWith(start)) ?? ["", "as logged"])[1];
 }
 
 const kinds = { heat: drawHeat, comparison: drawComparison, curves: drawCurves };

@@ -31,7 +31,8 @@ function apply() {
   }
   const rows = all("#runs tbody tr");
   const left = rows.filter((row) => !row.hasAttribute("data-out")).length;
-  $("matching").textContent = left === rows.length ? `${left} runs` : `${left} of ${rows.length} runs`;
+  const runs = `${rows.length} run${rows.length === 1 ? "" : "s"}`;
+  $("matching").textContent = left === rows.length ? runs : `${left} of ${runs}`;
   for (const listener of listeners) listener();
 }
 
