@@ -13,7 +13,7 @@ from hno.evaluation.closed_loop import TypeRow
 from hno.evaluation.format import NOT_AVAILABLE
 from hno.evaluation.outcome import Outcome
 from hno.evaluation.starts import Starts
-from hno.report.episode import Episode
+from hno.report.episode import Episode, Scene
 
 Curves = dict[str, list[tuple[int, float]]]
 """Metric -> step and value."""
@@ -62,6 +62,8 @@ class Run(BaseModel):
     """The configuration, dotted names."""
     curves: SkipValidation[Curves] = {}
     episodes: SkipValidation[list[Episode]] = []
+    scene: SkipValidation[Scene] = Scene()
+    """What is drawn around the players of its episodes."""
     outcomes: SkipValidation[dict[tuple[float, ...], Starts]] = {}
     """What came of single starts, by type; empty where it was not kept."""
     command: SkipValidation[str | None] = None

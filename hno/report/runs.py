@@ -15,7 +15,7 @@ from yaml import YAMLError, safe_load  # type: ignore[import-untyped]  # yaml ha
 
 from hno.data.folders import LOCK, held
 from hno.evaluation.starts import starts_from
-from hno.report.episode import episode
+from hno.report.episode import Scene, episode
 from hno.report.records import Curves, Run, sentence, type_row
 
 T = TypeVar("T")
@@ -140,16 +140,19 @@ def _run(folder: Path, name: str, content: Mapping[str, Any]) -> Run:
     with _noted(notes, "no learning curves"):
         found["curves"] = _curves(metrics) if metrics.exists() else {}
     with _noted(notes, "no episodes"):
-        found["episodes"] = _each(_beside(folder, content.get("episodes"), "episodes"), episode, "episode", notes)
+        played = _beside(folder, content.get("episodes"))
+        found["episodes"] = _each(played.get("episodes", []), episode, "episode", notes)
+        found["scene"] = Scene.model_validate(played.get("scene", {}))
     with _noted(notes, "no outcomes of single starts"):
-        starts = _each(_beside(folder, content.get("outcomes"), "types"), starts_from, "list of starts", notes)
+        types = _beside(folder, content.get("outcomes")).get("types", [])
+        starts = _each(types, starts_from, "list of starts", notes)
         found["outcomes"] = {one.theta: one for one in starts}
     return run.model_copy(update=found)
 
 
-def _beside(folder: Path, name: Any, entry: str) -> Any:
-    """An entry of a file that results name: one inside their folder, whatever they say; empty without a name."""
-    return read_json(folder / Path(name).name).get(entry) if isinstance(name, str) else []
+def _beside(folder: Path, name: Any) -> dict[str, Any]:
+    """A file that results name: one inside their folder, whatever they say; empty without a name."""
+    return read_json(folder / Path(name).name) if isinstance(name, str) else {}
 
 
 @contextmanager

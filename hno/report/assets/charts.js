@@ -46,7 +46,15 @@ function drawHeat(host) {
   const cells = DATA.maps[host.dataset.of];
   const columns = new Set(cells.map((cell) => cell.theta[0])).size;
   const step = Math.max(13, Math.min(38, Math.floor((host.clientWidth - 44) / columns)));
-  draw(host, "heat", { cells }, { x_step: step, y_step: step, small: step < 26, bound: $("shown").value });
+  const values = { x_step: step, y_step: step, small: step < 26, bound: $("shown").value };
+  draw(host, "heat", { cells }, values).then((view) =>
+    view?.addEventListener("click", (_event, item) => {
+      const theta = item?.datum?.theta;
+      if (!theta || !$("player")) return;
+      choose_type(`(${theta.join(", ")})`, DATA.members[host.dataset.of]);
+      $("episodes").scrollIntoView();
+    }),
+  );
 }
 
 function drawComparison(host) {
@@ -128,9 +136,22 @@ if (metric) {
   const names = [...new Set(DATA.curves.flatMap((curve) => Object.keys(curve.metrics)))].sort();
   metric.append(...names.map((name) => element("option", { value: name, textContent: name })));
   metric.value = ["closed_loop/collision_rate", "val/costate_error", "loss/total"].reduce((best, name) => (names.includes(name) ? name : best), names[0]);
-  metric.addEventListener("change", () => redraw("curves"));
+  metric.addEventListener("change", () => {
+    remember({ metric: metric.value });
+    redraw("curves");
+  });
 }
-$("shown")?.addEventListener("change", () => redraw("heat"));
+$("shown")?.addEventListener("change", () => {
+  remember({ shown: $("shown").value });
+  redraw("heat");
+});
+recallers.push(() => {
+  for (const select of [metric, $("shown")]) {
+    const wanted = select && remembered()[select.id];
+    if (wanted && [...select.options].some((option) => option.value === wanted)) select.value = wanted;
+  }
+  redraw("curves", "heat");
+});
 
 const everything = () => redraw(...Object.keys(kinds));
 let width = innerWidth;
