@@ -72,7 +72,7 @@ def strip(data: Any) -> Layers:
         .mark_line(strokeWidth=1.6, interpolate="linear")
         .encode(
             x=alt.X("t:Q", title="t [s]", axis=alt.Axis(grid=False, tickCount=5)),
-            y=alt.Y("y:Q", title=None, scale=values, axis=alt.Axis(grid=False, tickCount=3, format="~g")),
+            y=alt.Y("y:Q", title=None, scale=values, axis=alt.Axis(grid=False, tickCount=3)),
             color=alt.Color("player:N", legend=None),
             strokeDash=alt.StrokeDash(
                 "beside:N", legend=None, scale=alt.Scale(domain=[False, True], range=[[], [3, 2]])

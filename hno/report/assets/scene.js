@@ -177,7 +177,8 @@ function players(ctx, view, episode, scene, time, beside) {
       ctx.stroke();
     }
     const angle = heading(episode.t, episode.p, time, k);
-    const style = beside ? { strokeStyle: own, lineWidth: 1.5, dash: [3, 2] } : { fillStyle: own, strokeStyle: color("surface"), lineWidth: 1 };
+    const mine = colors[k % colors.length];
+    const style = beside ? { strokeStyle: mine, lineWidth: 1.5, dash: [3, 2] } : { fillStyle: mine, strokeStyle: color("surface"), lineWidth: 1 };
     body(ctx, view, point, scene.bodies?.[k], angle, style);
     if (beside) return;
     const [x, y] = view.px(point);
