@@ -38,7 +38,8 @@ class Kept(NamedTuple):
     content: dict[str, Any]
     """JSON content, see `episodes`."""
     path: dict[str, Tensor]
-    """At every step: t (K,), x (K, P, n), u (K - 1, P, m), value V_i (K, P); label_t, label_x, label_u, label_value."""
+    """At every step: t (K,), x (K, P, n), positions p (K, P, d), u (K - 1, P, m), V_i as value (K, P); the same of the
+    equilibrium at its nodes, with "label_" before."""
 
 
 def episodes(evaluation: Evaluation, found: Extremal, played: Trajectory, also: Collection[int] = ()) -> list[Kept]:
@@ -118,8 +119,10 @@ def _kept(evaluation: Evaluation, played: Trajectory, label: Extremal, row: int,
         "radius": None if apart is None else _rounded(violation[frames] + apart),
         "label_positions": _rounded(_at(t[frames], label.t, game.positions(label.x[row].to(places)))),
     }
-    path = {"t": t, "x": x, "u": played.u[row], "value": value.detach()}
-    path |= {f"label_{name}": getattr(label, name)[row] for name in ("x", "u", "value")} | {"label_t": label.t}
+    path = {"t": t, "x": x, "p": places, "u": played.u[row], "value": value.detach()}
+    own = {name: getattr(label, name)[row] for name in ("x", "u", "value")}
+    own |= {"t": label.t, "p": game.positions(own["x"].to(places))}
+    path |= {f"label_{name}": one for name, one in own.items()}
     return Kept(row, content, path)
 
 
