@@ -222,7 +222,7 @@ def perform(task: Task, settings: Any, folder: Path) -> bool:
         _log(error)
         return False
     finally:
-        finish_wandb(results.content)
+        finish_wandb(results.content, folder)
     show(results.content, folder)
     return True
 

@@ -8,7 +8,7 @@ import os
 import socket
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlparse
@@ -16,13 +16,14 @@ from urllib.parse import urlparse
 import lightning as L
 import torch
 import wandb
-from lightning.pytorch.callbacks import RichProgressBar
+from lightning.pytorch.callbacks import LearningRateMonitor, RichProgressBar
 from lightning.pytorch.loggers import Logger, TensorBoardLogger, WandbLogger
 
+from hno.cli import pages
 from hno.cli.curve import CurveLogger
 from hno.cli.settings import TrainSettings
 from hno.data.labels import Progress, Report
-from hno.report.runs import METRICS
+from hno.report.runs import METRICS, RESULTS
 
 log = logging.getLogger(__name__)
 MODES = ("online", "offline", "disabled", "shared", "dryrun", "run")
@@ -72,19 +73,42 @@ def _wandb(settings: TrainSettings, folder: Path, mode: str) -> Logger:
     known = sorted(folder.glob("wandb/*run-*-*"))
     return WandbLogger(
         name=folder.name, save_dir=folder, mode=mode, project=settings.logger.project, group=folder.parent.name,
+        job_type="train",
         config=settings.model_dump(), id=known[-1].name.rpartition("-")[2] if known else None, resume="allow",
     )  # fmt: skip
 
 
-def finish_wandb(results: Mapping[str, Any]) -> None:
+def rates(made: Sequence[Logger]) -> list[L.Callback]:
+    """What tells W&B the learning rate at every step that it is told the losses of."""
+    return [LearningRateMonitor("step")] if any(isinstance(one, WandbLogger) for one in made) else []
+
+
+def finish_wandb(results: Mapping[str, Any], folder: Path) -> None:
     """Close the W&B run of this process, if there is one, however the run ended: the next job gets its own.
+
+    The page, the results, what was played and the checkpoint that counts are its artifact.
 
     Args:
         results: content of results.json.
+        folder: where it lies.
     """
     if wandb.run is not None:
         wandb.run.summary.update({name: results[name] for name in ("status", "reason")})
+        try:
+            pages.write(folder)
+            wandb.run.log_artifact(_artifact(results, folder))
+        except Exception as error:  # what W&B refuses costs no run its results
+            log.warning("W&B did not take the files of the run: %s", error)
     wandb.finish(exit_code=int(results["status"] != "finished"))
+
+
+def _artifact(results: Mapping[str, Any], folder: Path) -> wandb.Artifact:
+    made = wandb.Artifact(f"run-{wandb.run.id if wandb.run else folder.name}", "run")
+    names = [pages.PAGE, RESULTS, *(results.get(key) for key in ("checkpoint", "episodes", "paths", "outcomes"))]
+    for name in names:
+        if name is not None and (folder / name).is_file():
+            made.add_file(str(folder / name))
+    return made
 
 
 def check_wandb() -> None:

@@ -14,7 +14,7 @@ from hno.cli.arguments import Arguments
 from hno.cli.build import build, check, how_to_train, record_of
 from hno.cli.config import configured
 from hno.cli.evaluate import describe, play_starts, unseen_types
-from hno.cli.logs import StepBar, StepLines, label_progress, loggers, use_threads
+from hno.cli.logs import StepBar, StepLines, label_progress, loggers, rates, use_threads
 from hno.cli.media import publish
 from hno.cli.results import Results
 from hno.cli.resume import finished, history, in_its_folder, run_folder, take_over, training_hash
@@ -94,7 +94,7 @@ def train_operator(settings: TrainSettings, folder: Path, results: Results) -> F
     try:
         fitted = fit(
             operator, objective, data, how_to_train(settings), folder, validation=first, later=later,
-            record=record_of(settings, built), loggers=makers, callbacks=[bar], resume=resume,
+            record=record_of(settings, built), loggers=makers, callbacks=[bar, *rates(makers)], resume=resume,
         )  # fmt: skip
     except DivergedError:
         if (folder / BEST).exists():

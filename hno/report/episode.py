@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Annotated, Any
 
 import numpy as np
@@ -75,8 +76,14 @@ class Episode(BaseModel):
 
         An episode without costs, or without a clearance, is not known to have lost anything.
         """
-        lost, near = self.lost, self.clearance
-        return not self.collided, math.inf if lost is None else -lost, math.inf if near is None else near
+        return lost_most(self.__dict__)
+
+
+def lost_most(content: Mapping[str, Any]) -> tuple[bool, float, float]:
+    """What episodes are ranked by, from their entry of episodes.json, see `Episode.order`."""
+    cost, best, near = (content.get(name) for name in ("cost", "label_cost", "clearance"))
+    lost = math.inf if cost is None or best is None else best - cost
+    return not content.get("collided"), lost, math.inf if near is None else near
 
 
 def episode(content: Any) -> Episode:
