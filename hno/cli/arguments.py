@@ -10,7 +10,7 @@ from hno.registry import unknown_name
 
 FLAGS = {
     "--dry-run": "print the configuration (with -m: the jobs) after it has been checked, and end",
-    "--to": "PATH: where results go; of an export, the kind of controller",
+    "--to": "PATH: where results go; of an export, the kind of controller; of episodes, the format",
     "--multirun": "(or -m) run every combination of values that are separated by commas; anywhere on the line",
     "--config-dir": "FOLDER: choices of your own, such as FOLDER/experiment/mine.yaml",
     "--no-window": "play one episode without a page, and print how it ends",

@@ -27,10 +27,11 @@ from hno.data.labels import Request, default_cache, labels_for, safe_labels_for
 from hno.evaluation.closed_loop import CollisionTable, play
 from hno.evaluation.comparison import PairedComparison, check_same_game
 from hno.evaluation.conditions import TIES, table_condition
-from hno.evaluation.episodes import EPISODES, episodes, together
+from hno.evaluation.episodes import EPISODES, PATHS, Kept, episodes, together, write_paths
 from hno.evaluation.format import title
 from hno.evaluation.outcome import Played, numbers_of
 from hno.evaluation.sections import Evaluation
+from hno.evaluation.starts import OUTCOMES, starts_of
 from hno.games import Game
 from hno.games.grid import parse_types, quarter_types
 from hno.runtime import ArtefactError
@@ -135,10 +136,11 @@ def evaluate(settings: EvaluateSettings, results: Results) -> None:
         for policy, evaluation in zip(policies, evaluations, strict=True)
     ]
     results.update(**models[0])
-    played = list[Evaluation]()
-    for model, evaluation in zip(models, evaluations, strict=True):
+    played, shared = list[Evaluation](), dict[Types, list[int]]()
+    for number, (model, evaluation) in enumerate(zip(models, evaluations, strict=True)):
         log.info("evaluation of %s", evaluation.name)
-        found, model["table"] = play_starts(evaluation, results)
+        found, files = play_starts(evaluation, results, number, shared)
+        model.update(files)
         played.append(found)
         for name, content in run_sections(found, results):
             model[name] = content
@@ -178,35 +180,54 @@ def unseen_types(game: Game, choice: Any, key: str) -> list[Types]:
     return [] if choice == [] else parse_types(game, choice, key=key)
 
 
-def play_starts(evaluation: Evaluation, results: Results) -> tuple[Evaluation, Table]:
+def play_starts(
+    evaluation: Evaluation, results: Results, number: int = 0, shared: dict[Types, list[int]] | None = None
+) -> tuple[Evaluation, dict[str, Any]]:
     """Play from the test starts, whose labels are in the cache or solved now.
 
-    The first model's table goes into the results, and some of its episodes are kept.
+    Some episodes are kept beside the results, and what came of every start; the first model's table is in the results.
+
+    Args:
+        evaluation: the model.
+        results: of the run.
+        number: of the model, which is in the names of its files.
+        shared: starts, by type, whose episodes all models keep; the first one adds those that it has.
 
     Returns:
-        The evaluation with its labels and episodes, and the rows of its table.
+        The evaluation with its labels and episodes, and the model's entries of the results: its table and files.
     """
-    began, game, folder = time.perf_counter(), evaluation.game, results.path.parent
+    began, game, shared = time.perf_counter(), evaluation.game, {} if shared is None else shared
     labels, disturbance = evaluation.solve(evaluation.condition), evaluation.condition.disturbance
-    solved, played, kept = time.perf_counter(), list[Played](), list[dict[str, Any]]()
+    solved, played, kept = time.perf_counter(), list[Played](), list[Kept]()
     with progress("evaluation") as update:
         update(0, len(labels))
         for label, paths in play(game, evaluation.policy, labels, evaluation.dt, disturbance):
+            theta = tuple(label.theta[0].tolist())
             played.append(numbers_of(game, label, paths))
-            kept += episodes(evaluation, label, paths)
+            own = episodes(evaluation, label, paths, shared.get(theta, ()))
+            shared.setdefault(theta, [one.row for one in own])
+            kept += own
             update(len(played), len(labels))
     found = evaluation._replace(labels=labels, played=played)
-    table = CollisionTable().compute(found)
+    entries = {"table": CollisionTable().compute(found), **_write(found, kept, results.path.parent, number)}
     results.time("test_labels", solved - began)
     results.time("evaluation", time.perf_counter() - solved)
     if results.content["episodes"] is None:
-        write_json(folder / EPISODES, together(game, kept))
         conditions = {name: found.options[name] for name in ("clearance", "dt", "widen", "noise", "delay")}
         conditions["learns"] = found.options.get("learns")  # what no run has while it trains
-        results.update(**conditions, test_seed=disturbance.seed, constraint_unit=game.constraint_unit)
-        results.update(table=table, episodes=EPISODES)
-        draw_typical(kept, folder / "rollout.png", title(results.content))
-    return found, table
+        results.update(**conditions, test_seed=disturbance.seed, constraint_unit=game.constraint_unit, **entries)
+        draw_typical([one.content for one in kept], results.path.parent / "rollout.png", title(results.content))
+    return found, entries
+
+
+def _write(found: Evaluation, kept: Sequence[Kept], folder: Path, number: int) -> dict[str, str]:
+    """Write what is kept of a model's episodes; returns the names of the files."""
+    names = {"episodes": EPISODES, "paths": PATHS, "outcomes": OUTCOMES}
+    files = {key: name.replace(".", f"_{number}.", 1) if number else name for key, name in names.items()}
+    write_json(folder / files["outcomes"], {"types": starts_of(found)})
+    write_json(folder / files["episodes"], together(found.game, kept))
+    write_paths(kept, folder / files["paths"])
+    return files
 
 
 def check_evaluation(game: Game, settings: Episodes) -> None:

@@ -15,12 +15,12 @@ from typing import Any, NamedTuple
 
 from hydra.core.hydra_config import HydraConfig
 from lightning.fabric.utilities.exceptions import MisconfigurationException
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 import hno
 from hno.cli import pages
 from hno.cli.arguments import Arguments, UsageError, one_screen, quoted
-from hno.cli.config import REFUSALS, configured, for_hydra, register_plugins, sentence, under_hydra
+from hno.cli.config import REFUSALS, configured, for_hydra, groups, register_plugins, sentence, under_hydra
 from hno.cli.logs import finish_wandb
 from hno.cli.objective import Objective, objective
 from hno.cli.output import fresh, owned
@@ -29,6 +29,7 @@ from hno.cli.results import Results, recorded
 from hno.cli.schema import REGISTRIES
 from hno.cli.sections import show
 from hno.cli.sweep import Entry, Job, Ledger, show_jobs
+from hno.cli.swept import named, swept_keys
 from hno.evaluation.format import NAMES, counted
 from hno.processes import Interrupted, follow, interruptible, passed_on
 from hno.registry import UnknownNameError
@@ -123,12 +124,22 @@ def _multirun(task: Task, given: Arguments) -> int:
         with tempfile.TemporaryDirectory() as nowhere, ExitStack() as stack:
             folder = Path(nowhere) if dry else _chosen("hydra.sweep.dir", given, HydraConfig.get().sweep.dir)
             stack.enter_context(owned(folder, jobs=True))
-            words = [*_here(words), *QUIET] if dry else words
+            words = [*_here(words), *QUIET] if dry else [*words, *_named(task, words)]
             if not dry:
                 print(f"Sweep: {folder}", flush=True)
             return _swept(task, ["--multirun", *words, f"hydra.sweep.dir={quoted(str(folder))}"], folder, dry)
     except REFUSALS as error:
         raise _refusal(error) from error
+
+
+def _named(task: Task, words: Sequence[str]) -> list[str]:
+    """Name the folders of jobs by what was swept, unless the command line names them."""
+    if any(word.lstrip("+").startswith("hydra.sweep.subdir=") for word in words):
+        return []
+    hydra = HydraConfig.get()
+    pattern = str(OmegaConf.to_container(hydra.sweep)["subdir"])  # type: ignore[index,call-overload]
+    keys = swept_keys(words, hydra.sweeper.get("params") or {})
+    return [f"hydra.sweep.subdir={quoted(named(pattern, keys, groups(task.name)))}"] if keys else []
 
 
 def _here(words: Sequence[str]) -> list[str]:
@@ -228,7 +239,7 @@ def perform(task: Task, settings: Any, folder: Path) -> Results | None:
         _log(error)
         return None
     finally:
-        finish_wandb(results.content)
+        finish_wandb(results.content, folder)
     show(results.content, folder)
     return results
 

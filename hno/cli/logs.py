@@ -9,17 +9,19 @@ import os
 import shlex
 import socket
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlparse
 
 import torch
+from lightning.pytorch.callbacks import Callback, LearningRateMonitor
 from lightning.pytorch.loggers import Logger, TensorBoardLogger, WandbLogger
 
+from hno.cli import pages
 from hno.cli.curve import CurveLogger
 from hno.cli.settings import TrainSettings
-from hno.report.runs import METRICS
+from hno.report.runs import METRICS, RESULTS
 
 log = logging.getLogger(__name__)
 MODES = ("online", "offline", "disabled", "shared", "dryrun", "run")
@@ -73,17 +75,40 @@ def _wandb(settings: TrainSettings, folder: Path, mode: str) -> Logger:
     return logger
 
 
-def finish_wandb(results: Mapping[str, Any]) -> None:
+def rates(made: Sequence[Logger], chosen: Sequence[Callback]) -> list[Callback]:
+    """What tells W&B the learning rate at every step that it is told the losses of, unless it is chosen anyway."""
+    there = any(isinstance(one, LearningRateMonitor) for one in chosen)
+    return [LearningRateMonitor("step")] if not there and any(isinstance(one, WandbLogger) for one in made) else []
+
+
+def finish_wandb(results: Mapping[str, Any], folder: Path) -> None:
     """Close the W&B run of this process, if there is one, however the run ended: the next job gets its own.
+
+    The page, the results, what was played and the checkpoint that counts are its artifact.
 
     Args:
         results: content of results.json.
+        folder: where it lies.
     """
     wandb = sys.modules.get("wandb")  # of a logger that used it
     if wandb is None or wandb.run is None:
         return
     wandb.run.summary.update({name: results[name] for name in ("status", "reason")})
+    try:
+        pages.write(folder)
+        wandb.run.log_artifact(_artifact(wandb, results, folder))
+    except Exception as error:  # what W&B refuses costs no run its results
+        log.warning("W&B did not take the files of the run: %s", error)
     wandb.finish(exit_code=int(results["status"] != "finished"))
+
+
+def _artifact(wandb: Any, results: Mapping[str, Any], folder: Path) -> Any:
+    made = wandb.Artifact(f"run-{wandb.run.id}", "run")
+    names = [pages.PAGE, RESULTS, *(results.get(key) for key in ("checkpoint", "episodes", "paths", "outcomes"))]
+    for name in names:
+        if name is not None and (folder / name).is_file():
+            made.add_file(str(folder / name))
+    return made
 
 
 def check_wandb() -> None:

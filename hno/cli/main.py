@@ -62,6 +62,12 @@ COMMANDS = {
         "Write a page about a run or a sweep, or figures for documents.",
         "report", "folder", ("to",), ("--dry-run", "--to"),
     ),
+    "episodes": Command(
+        "hno.cli.episodes:run", "RUN --to csv|commonroad|mcap [folder=FOLDER]",
+        "Write a run's episodes for other programs. States, controls and values at every step, with the equilibrium's; "
+        "into RUN/episodes by default.",
+        flags=("--to",),
+    ),
     "export": Command(
         "hno.cli.export:run", "RUN|CHECKPOINT --to numpy|c|onnx|torch [folder=FOLDER]",
         "Write a controller that runs without this package. It is compared with the checkpoint before it is written.",

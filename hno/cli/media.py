@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -81,8 +80,8 @@ def draw(results: Mapping[str, Any], folder: Path, kinds: Collection[type[Logger
 
         if WandbLogger in kinds and (worst := worst_episode(results, folder)):
             smallest = f"{number(worst['clearance'])} {results.get('constraint_unit', 'm')}".strip()
-            heading = f"{title(results)}\nsmallest clearance, {smallest} at ({name_of(worst['theta'])})"
-            _draw_episode(worst, made["worst_episode"], heading)
+            heading = f"most lost against the equilibrium at ({name_of(worst['theta'])}), clearance {smallest}"
+            _draw_episode(worst, made["worst_episode"], f"{title(results)}\n{heading}")
         if {WandbLogger, TensorBoardLogger} & set(kinds):
             collision_map(results["table"], made["collision_map"], title(results))
     return {name: path for name, path in made.items() if path.exists()}
@@ -116,11 +115,13 @@ def _harmless() -> Iterator[None]:
 
 
 def worst_episode(results: Mapping[str, Any], folder: Path) -> dict[str, Any] | None:
-    """The stored episode of the smallest clearance, above all one that is not finite; None if the run stored none."""
+    """The stored episode that lost most against the equilibrium, see `Episode.order`; None if the run stored none."""
+    from hno.report.episode import lost_most
+
     if not results.get("episodes"):
         return None
     episodes = json.loads((folder / results["episodes"]).read_text())["episodes"]
-    return min(episodes, key=lambda one: -math.inf if one["clearance"] is None else one["clearance"], default=None)
+    return min(episodes, key=lost_most, default=None)
 
 
 def _send_to_wandb(logger: WandbLogger, table: Sequence[Any], pictures: Mapping[str, Path], step: int) -> None:
@@ -129,5 +130,16 @@ def _send_to_wandb(logger: WandbLogger, table: Sequence[Any], pictures: Mapping[
     logger.experiment.summary["test/worst_theta"] = name_of(whole.worst_theta or ()) or nobody
     for name, path in pictures.items():
         logger.log_image(name, [str(path)], step)
-    columns = list(table[0]) if table else []
-    logger.log_table("types", columns, [[str(row[name]) for name in columns] for row in table], step=step)
+    rows = [_flat(row) for row in table]
+    columns = list(dict.fromkeys(name for row in rows for name in row))
+    logger.log_table("types", columns, [[row.get(name) for name in columns] for row in rows], step=step)
+
+
+def _flat(row: Mapping[str, Any]) -> dict[str, Any]:
+    """A row of the collision table with one number in every cell: types by name, lists with an entry's place."""
+    found: dict[str, Any] = {"types": name_of(row["theta"])}
+    for name, value in row.items():
+        entries = value if isinstance(value, (list, tuple)) else [value]
+        names = [name] if entries is not value else [f"{name}_{k + 1}" for k in range(len(entries))]
+        found |= dict(zip(names, entries, strict=True))
+    return found

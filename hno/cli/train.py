@@ -13,7 +13,7 @@ from hno.cli.arguments import Arguments
 from hno.cli.build import build, check, chosen_callbacks, how_to_train, record_of
 from hno.cli.config import configured
 from hno.cli.evaluate import describe, play_starts, unseen_types
-from hno.cli.logs import loggers, use_threads
+from hno.cli.logs import loggers, rates, use_threads
 from hno.cli.media import publish
 from hno.cli.progress import StepLines, label_progress, progress
 from hno.cli.results import Results
@@ -93,10 +93,11 @@ def train_operator(settings: TrainSettings, folder: Path, results: Results) -> F
     first, later = validation_starts(settings, data, results)
     try:
         with progress("training", None) as update:
+            chosen = chosen_callbacks(settings)
+            callbacks = [*chosen, *rates(makers, chosen), StepLines(settings.trainer.print_every, update)]
             fitted = fit(
                 operator, objective, data, how_to_train(settings), folder, validation=first, later=later,
-                record=record_of(settings, built), loggers=makers, resume=resume,
-                callbacks=[*chosen_callbacks(settings), StepLines(settings.trainer.print_every, update)],
+                record=record_of(settings, built), loggers=makers, callbacks=callbacks, resume=resume,
             )  # fmt: skip
     except DivergedError:
         if (folder / BEST).exists():

@@ -3,81 +3,132 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Collection, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from safetensors.torch import save_file
 from torch import Tensor
 
 from hno.control.belief import Believing, all_learning
 from hno.data.branches import rotations
 from hno.data.certificates import safe
+from hno.data.store import replace_whole
 from hno.evaluation.sections import Evaluation
+from hno.evaluation.starts import key_of
 from hno.games import Game
 from hno.games.kinematics import separation
 from hno.types import Extremal, Points, PotentialField, Trajectory
 
-EPISODES = "episodes.json"
-"""Name of their file inside a run's folder."""
+EPISODES, PATHS = "episodes.json", "episodes.safetensors"
+"""Names of their files inside a run's folder: what is drawn, and states, controls and values at every step."""
 FRAMES = 50
 """An episode is kept at about so many times, and where players are closest."""
 TURN = 0.5
 """Angle that two players must turn around each other, rad, before it counts which way they do so."""
 
 
-def episodes(evaluation: Evaluation, found: Extremal, played: Trajectory) -> list[dict[str, Any]]:
-    """The worst and the typical episode of one type, among the starts that count.
+class Kept(NamedTuple):
+    """An episode that is kept."""
+
+    row: int
+    """Its start, among those of its type."""
+    content: dict[str, Any]
+    """JSON content, see `episodes`."""
+    path: dict[str, Tensor]
+    """At every step: t (K,), x (K, P, n), positions p (K, P, d), u (K - 1, P, m), V_i as value (K, P); the same of the
+    equilibrium at its nodes, with "label_" before."""
+
+
+def episodes(evaluation: Evaluation, found: Extremal, played: Trajectory, also: Collection[int] = ()) -> list[Kept]:
+    """The worst and the typical episode of one type, among the starts that count, and those of further starts.
+
+    The worst is where most was lost against the equilibrium: a collision, since the equilibrium is safe, and of several
+    the one with the largest joint cost above the equilibrium's. Typical is the start whose equilibrium has the median
+    cost: the same for every policy that plays these starts.
+
+    Args:
+        evaluation: the model.
+        found: labels of the starts of one type.
+        played: the episodes from there.
+        also: rows of further starts to keep, such as those that another model's file has.
 
     Returns:
-        JSON content: positions of all players over time, the distance below which it is a collision where the
-        constraint is one, the branch of a potential that is played, what is believed of types where players learn, the
-        path of the equilibrium from the same start and whether players pass on another side than there, costs. Nothing
-        without a start that counts.
+        JSON content: positions, controls, speeds and values of all players over time, the distance below which it is a
+        collision where the constraint is one, the branch of a potential that is played, what is believed of types where
+        players learn, the path of the equilibrium from the same start and whether players pass on another side than
+        there, costs. Nothing without a start that counts.
     """
     counted = safe(found, evaluation.clearance).nonzero().squeeze(-1)
     if len(counted) == 0:
         return []
-    near = played.clearance[counted]
-    chosen = {"worst": near.argmin(), "typical": near.argsort()[len(near) // 2]}  # NaN is the smallest
-    return [{"kind": kind, **_episode(evaluation, played, found, int(counted[k]))} for kind, k in chosen.items()]
+    cost = found.cost[counted].nan_to_num(math.inf)
+    lost = (played.cost[counted] - found.cost[counted].to(played.cost)).double().nan_to_num(math.inf, posinf=math.inf)
+    order = sorted(range(len(counted)), key=lambda k: (bool(played.collided[counted[k]]), float(lost[k])))
+    chosen = {"worst": order[-1], "typical": int(cost.argsort(stable=True)[len(cost) // 2])}
+    rows = [(kind, int(counted[k])) for kind, k in chosen.items()]
+    rows += [("compared", row) for row in also if row not in dict(rows).values()]
+    key = key_of(found.x[:, 0])
+    return [_kept(evaluation, played, found, row, {"kind": kind, "start": f"{key}/{row}"}) for kind, row in rows]
 
 
-def together(game: Game, kept: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def together(game: Game, kept: Sequence[Kept]) -> dict[str, Any]:
     """JSON content of a file of episodes, with what is common to all of them."""
-    dimensions = game.positions(game.state_box.lo).shape[-1]
+    dimensions, scene = game.positions(game.state_box.lo).shape[-1], game.scene()
     units = {"players": game.players, "dimensions": dimensions, "constraint_unit": game.constraint_unit}
-    return {**units, "episodes": kept}
+    sizes = {"states": game.state_dim, "controls": game.control_dim, "players": game.players}
+    names = {kind: scene.named(kind, count) for kind, count in sizes.items()}
+    drawn = {"bodies": scene.bodies, "roads": [road._asdict() for road in scene.roads], "note": scene.note, **names}
+    return {**units, "scene": drawn, "episodes": [one.content for one in kept]}
 
 
-def _episode(evaluation: Evaluation, played: Trajectory, label: Extremal, row: int) -> dict[str, Any]:
+def write_paths(kept: Sequence[Kept], path: Path) -> None:
+    """Write states, controls and values at every step into a safetensors file, `<number of the episode>.<name>`."""
+    found = {f"{k}.{name}": tensor.float().cpu() for k, one in enumerate(kept) for name, tensor in one.path.items()}
+    replace_whole(path, lambda draft: save_file({name: one.contiguous().clone() for name, one in found.items()}, draft))
+
+
+def _kept(evaluation: Evaluation, played: Trajectory, label: Extremal, row: int, names: dict[str, str]) -> Kept:
     game, theta = evaluation.game, label.theta[row].to(played.x)
-    violation = game.constraint(played.x[row], theta.expand(len(played.t), -1)).flatten(1).amax(-1)
+    x, t = played.x[row], played.t
+    violation = game.constraint(x, theta.expand(len(t), -1)).flatten(1).amax(-1)
     closest = int(violation.nan_to_num(-math.inf).argmax())
-    frames = sorted({*range(0, len(played.t), math.ceil(len(played.t) / FRAMES)), closest})
-    t, places = played.t[frames], game.positions(played.x[row, frames])
-    apart = separation(places).amin(-1) if game.players > 1 and game.distance_constraints else None
-    return {
+    frames = sorted({*range(0, len(t), math.ceil(len(t) / FRAMES)), closest})
+    places = game.positions(x)
+    apart = separation(places[frames]).amin(-1) if game.players > 1 and game.distance_constraints else None
+    points = Points(game.horizon - t, x, theta.expand(len(t), -1))
+    field = evaluation.policy.operator.field(points)
+    value = field.players if isinstance(field, PotentialField) else field.value
+    numbers = {name: getattr(played, name)[row] for name in ("clearance", "distance", "cost")}
+    content = {
+        **names,
         "theta": [float(entry) for entry in theta],
         "collided": bool(played.collided[row]),
-        "clearance": _rounded(played.clearance[row]),
-        "distance": _rounded(played.distance[row]),
-        "cost": _rounded(played.cost[row]),
+        **{name: _rounded(number) for name, number in numbers.items()},
         "label_cost": _rounded(label.cost[row]),
-        "t": _rounded(t),
-        "positions": _rounded(places),
-        "branch": _branches(evaluation, Points(game.horizon - t, played.x[row, frames], theta.expand(len(t), -1))),
+        "t": _rounded(t[frames]),
+        "positions": _rounded(places[frames]),
+        "speed": _rounded(_speed(t, places)[frames]),
+        "controls": _rounded(played.u[row][[min(frame, len(t) - 2) for frame in frames]]),
+        "value": _rounded(value[frames]),
+        "branch": field.branches.argmax(-1)[frames].tolist() if isinstance(field, PotentialField) else None,
         "belief": _belief(evaluation, played, theta, row, frames),
-        "other_side": _other_side(game, played.x[row], label.x[row]),
+        "other_side": _other_side(game, x, label.x[row]),
         "radius": None if apart is None else _rounded(violation[frames] + apart),
-        "label_positions": _rounded(_at(t, label.t, game.positions(label.x[row].to(places)))),
+        "label_positions": _rounded(_at(t[frames], label.t, game.positions(label.x[row].to(places)))),
     }
+    path = {"t": t, "x": x, "p": places, "u": played.u[row], "value": value.detach()}
+    own = {name: getattr(label, name)[row] for name in ("x", "u", "value")}
+    own |= {"t": label.t, "p": game.positions(own["x"].to(places))}
+    path |= {f"label_{name}": one for name, one in own.items()}
+    return Kept(row, content, path)
 
 
-def _branches(evaluation: Evaluation, points: Points) -> list[int] | None:
-    """The branch that is played at each point; None for an operator without branches."""
-    field = evaluation.policy.operator.field(points)
-    return field.branches.argmax(-1).tolist() if isinstance(field, PotentialField) else None
+def _speed(t: Tensor, places: Tensor) -> Tensor:
+    """Speeds along positions (K, P, d), m/s, (K, P)."""
+    return torch.gradient(places, spacing=(t,), dim=0)[0].norm(dim=-1)
 
 
 def _belief(evaluation: Evaluation, played: Trajectory, theta: Tensor, row: int, frames: Sequence[int]) -> Any:

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from hno.games.box import Box
 from hno.games.final import FinalMethods
 from hno.games.fingerprint import fingerprint
+from hno.games.scene import Scene
 from hno.registry import Registry
 
 games: Registry[Game] = Registry("game", "hno.games", base="hno.games.base:Game")
@@ -118,6 +119,10 @@ class Game(FinalMethods, nn.Module, abc.ABC):
     def positions(self, x: Tensor) -> Tensor:
         """Where the players are in one common frame, m, (B, P, n) -> (B, P, 2 or 3); distances and pictures use it."""
 
+    def scene(self) -> Scene:
+        """What pictures draw around the players, and names; nothing is decided by it. Points in empty space."""
+        return Scene()
+
     def state_cost(self, x: Tensor, theta: Tensor) -> Tensor:
         """Further running cost of states, such as tracking, 1/s, (B, P, n), (B, P) -> (B, P); 0 by default."""
         return torch.zeros_like(x[..., 0])
@@ -198,7 +203,7 @@ class Game(FinalMethods, nn.Module, abc.ABC):
         return self.best_response(x, own_costate(costate))
 
     def violates(self, x: Tensor, theta: Tensor) -> Tensor:
-        """Whether any constraint is violated (or just met), shape (B,)."""
+        """Whether any constraint is violated (or just met), (B,)."""
         return (self.constraint(x, theta) >= 0).flatten(-2).any(-1)
 
     def validate_types(self, types: Sequence[Sequence[float]]) -> list[tuple[float, ...]]:

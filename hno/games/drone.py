@@ -11,6 +11,7 @@ from hno.games.base import games
 from hno.games.box import Box
 from hno.games.collision import CollisionAvoidance
 from hno.games.kinematics import GRAVITY, double_integrator_drift
+from hno.games.scene import Scene
 
 
 @final
@@ -56,6 +57,12 @@ class Drone(CollisionAvoidance):
         """Player 2's px and py run from the opposite corner, m, (B, 2, 3)."""
         ahead, behind = x[..., 0, :3], x[..., 1, :3]
         return torch.stack([ahead, torch.cat([self.width - behind[..., :2], behind[..., 2:]], -1)], -2)
+
+    def scene(self) -> Scene:
+        """Two drones, points in space."""
+        states = ("px [m]", "py [m]", "pz [m]", "vx [m/s]", "vy [m/s]", "vz [m/s]")
+        players = ("drone 1, from the origin", "drone 2, from the opposite corner")
+        return Scene((), (), states, ("roll [rad]", "pitch [rad]", "thrust [m/s²]"), players)
 
     def terminal_value(self, x: Tensor) -> Tensor:
         """Hover at height 0, (B, 2)."""

@@ -10,6 +10,10 @@ from torch import Tensor
 from hno.games.affine import ControlAffineGame
 from hno.games.base import games
 from hno.games.box import Box
+from hno.games.scene import CAR, CAR_CONTROLS, Road, Scene
+
+ROAD = 4.0
+"""Width of the roads in pictures, m."""
 
 
 @final
@@ -62,6 +66,13 @@ class Intersection(ControlAffineGame):
         """Along x and along y, the intersection around the origin, m, (B, 2, 2)."""
         driven = x[..., 0] - (self.near + self.far) / 2
         return torch.diag_embed(driven)
+
+    def scene(self) -> Scene:
+        """Two cars on crossing roads of one lane each."""
+        roads = Road(0, (-ROAD / 2, ROAD / 2)), Road(1, (-ROAD / 2, ROAD / 2))
+        note = "Bodies of 4.5 m by 1.8 m and roads 4 m wide are drawn for the eye; intervals of the roads decide."
+        players = ("car 1, along x", "car 2, along y")
+        return Scene((CAR, CAR), roads, ("distance driven [m]", "speed [m/s]"), CAR_CONTROLS[1:], players, note)
 
     def constraint(self, x: Tensor, theta: Tensor) -> Tensor:
         """How far both players are inside their intervals, m, (B, 2, 1)."""

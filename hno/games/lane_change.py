@@ -11,6 +11,7 @@ from hno.games.base import games
 from hno.games.box import Box
 from hno.games.cars import Cars
 from hno.games.kinematics import DEGREE
+from hno.games.scene import CAR, CAR_CONTROLS, CAR_STATES, Road, Scene
 
 
 @final
@@ -48,6 +49,15 @@ class LaneChange(Cars):
     def positions(self, x: Tensor) -> Tensor:
         """(px, py) of both players in the same frame, m, (B, 2, 2)."""
         return x[..., :2]
+
+    def scene(self) -> Scene:
+        """Two cars on a road of two lanes, whose middles are the lateral positions that they aim for."""
+        low, high = sorted(map(float, self.lanes))
+        half = (high - low) / 2
+        note = "Bodies of 4.5 m by 1.8 m and the edges of the lanes are drawn for the eye; the game knows neither."
+        players = tuple(f"car {i + 1}, to the lane at {float(lane):g} m" for i, lane in enumerate(self.lanes))
+        road = Road(0, (low - half, high + half), ((low + high) / 2,))
+        return Scene((CAR, CAR), (road,), CAR_STATES, CAR_CONTROLS, players, note)
 
     def terminal_value(self, x: Tensor) -> Tensor:
         """Reach the other lane, straight and at nominal speed, (B, 2)."""

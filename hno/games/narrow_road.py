@@ -11,6 +11,7 @@ from hno.games.base import games
 from hno.games.box import Box
 from hno.games.cars import Cars
 from hno.games.kinematics import DEGREE
+from hno.games.scene import CAR, CAR_CONTROLS, CAR_STATES, Road, Scene
 
 
 @final
@@ -41,6 +42,13 @@ class NarrowRoad(Cars):
         """Player 2's px runs from the other end of the road, m, (B, 2, 2)."""
         along, across = x[..., 0], x[..., 1]
         return torch.stack([torch.stack([along[..., 0], self.length - along[..., 1]], -1), across], -1)
+
+    def scene(self) -> Scene:
+        """Two cars on a road as wide as the PDE box."""
+        edges = float(self.state_box.lo[0, 1]), float(self.state_box.hi[0, 1])
+        note = "Bodies of 4.5 m by 1.8 m and a road as wide as the PDE box are drawn for the eye: the game has neither."
+        players = ("car 1, from the left", "car 2, from the right")
+        return Scene((CAR, CAR), (Road(0, edges),), CAR_STATES, CAR_CONTROLS, players, note)
 
     def terminal_value(self, x: Tensor) -> Tensor:
         """Stay in the lane at nominal speed, (B, 2)."""

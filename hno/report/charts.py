@@ -9,6 +9,7 @@ from typing import Any, Literal
 import altair as alt
 
 from hno.report import vega
+from hno.report.strips import STRUCK, beliefs, heading, separation, strip
 from hno.report.vega import Layers, colors
 
 LEAST = 0.001
@@ -20,7 +21,6 @@ LABEL = (
 """A rate in %, short enough for a cell; a collision is never rounded away."""
 WHOLE = {"left": 0.0, "right": 10.0, "bottom": 0.0, "top": 10.0}
 """Signals of `encounter`: the part of space in which everything happens, m."""
-STRUCK = "datum.radius !== null && datum.distance < datum.radius"
 
 
 def heat_map(data: Any, legend: alt.Legend | None = None) -> Layers:
@@ -86,13 +86,16 @@ def comparison(data: Any) -> Layers:
 
 
 def learning_curves(data: Any, scale: Literal["log", "linear"]) -> Layers:
-    """A metric over training steps, one line for every run, from rows with step, value, run and recipe."""
+    """A metric over training steps, one line for every run, from rows with step, value, run and recipe.
+
+    Its signal "metric" is the name above the vertical axis, with a unit if it has one.
+    """
     values = alt.Scale(type=scale, zero=False, nice=False)
     base = (
         alt.Chart(data)
         .transform_calculate(tip="datum.run + '\\nstep ' + datum.step + ': ' + datum.value")
         .encode(
-            x=alt.X("step:Q", title="step", axis=alt.Axis(grid=False, tickCount=5)),
+            x=alt.X("step:Q", title="training step", axis=alt.Axis(grid=False, tickCount=5)),
             y=alt.Y("value:Q", title=None, scale=values, axis=alt.Axis(format="~g", tickCount=4, grid=False)),
             color=alt.Color("recipe:N", legend=alt.Legend(title=None, orient="bottom", columns=2, labelLimit=260)),
             detail="run:N",
@@ -100,7 +103,11 @@ def learning_curves(data: Any, scale: Literal["log", "linear"]) -> Layers:
     )
     lines = base.mark_line(strokeWidth=1.4, opacity=0.75, interpolate="linear")
     points = base.mark_circle(size=60, opacity=0).encode(tooltip="tip:N")
-    return alt.layer(lines, points).properties(width="container", height=200)
+    return (
+        alt.layer(lines, points)
+        .properties(width="container", height=200, title=heading("metric"))
+        .add_params(*colors(), alt.param(name="metric", value=""))
+    )
 
 
 def encounter(
@@ -167,61 +174,13 @@ def _paths(frames: Any, x: str, y: str) -> alt.Chart:
     )
 
 
-def separation(frames: Any, frame: int = 0) -> Layers:
-    """Distance between players over time, up to six times that below which it is a collision; one frame is marked."""
-    far, radius = (f"extent(pluck(data('frames'), '{name}'))[1]" for name in ("distance", "radius"))
-    reach = alt.param(name="reach", expr=f"isValid({radius}) ? min({far}, 6 * {radius}) : {far}")
-    base = alt.Chart(frames).encode(x=alt.X("t:Q", title="t [s]", axis=alt.Axis(grid=False, tickCount=5)))
-    scale = alt.Scale(domain=[0, alt.expr("reach")], nice=False)
-    height = alt.Y("distance:Q", title="distance [m]", scale=scale, axis=alt.Axis(grid=False, tickCount=4))
-    now = base.transform_filter("datum.frame === frame")
-    dot = now.mark_circle(size=60, opacity=1, clip=True, color=alt.expr(f"{STRUCK} ? danger : ink"))
-    return (
-        alt.layer(
-            base.mark_area(color=alt.expr("danger"), opacity=0.12).encode(y="radius:Q"),
-            base.mark_line(color=alt.expr("danger"), strokeWidth=1.2).encode(y="radius:Q"),
-            base.mark_line(color=alt.expr("ink"), strokeWidth=1.8, clip=True).encode(y=height),
-            now.mark_rule(color=alt.expr("muted"), strokeDash=[3, 3]),
-            dot.encode(y=height),
-        )
-        .properties(width="container", height=110)
-        .add_params(*colors(), alt.param(name="frame", value=frame), reach)
-    )
-
-
-def beliefs(frames: Any, frame: int = 0) -> Layers:
-    """What is believed of every type over time: mean and 90 %, beside the type, dashed; one frame is marked."""
-    base = (
-        alt.Chart(frames)
-        .transform_filter("isValid(datum.mean)")
-        .transform_calculate(player="sequence(1, length(datum.mean) + 1)")
-        .transform_flatten(["player", "mean", "low", "high", "type"])
-        .encode(
-            x=alt.X("t:Q", title="t [s]", axis=alt.Axis(grid=False, tickCount=5)),
-            color=alt.Color("player:N", legend=None),
-        )
-    )
-    height = alt.Y("mean:Q", title="believed type", scale=alt.Scale(zero=False), axis=alt.Axis(grid=False, tickCount=4))
-    now = alt.Chart(frames).transform_filter("datum.frame === frame").encode(x="t:Q")
-    return (
-        alt.layer(
-            base.mark_area(opacity=0.15).encode(y=alt.Y("low:Q", title="believed type"), y2="high:Q"),
-            base.mark_line(strokeDash=[5, 4], strokeWidth=1.5, opacity=0.7).encode(y="type:Q"),
-            base.mark_line(strokeWidth=1.8).encode(y=height),
-            now.mark_rule(color=alt.expr("muted"), strokeDash=[3, 3]),
-        )
-        .properties(width="container", height=110)
-        .add_params(*colors(), alt.param(name="frame", value=frame))
-    )
-
-
 @functools.cache
 def specifications() -> dict[str, Any]:
     """Vega specifications of the page's charts, without data and colours."""
     cells, rows, points, frames = (alt.NamedData(name) for name in ("cells", "recipes", "points", "frames"))
     charts = {
         "heat": heat_map(cells), "comparison": comparison(rows), "log": learning_curves(points, "log"),
-        "linear": learning_curves(points, "linear"), "top": encounter(frames, "y"), "side": encounter(frames, "z"),
-        "separation": separation(frames), "beliefs": beliefs(frames),
+        "linear": learning_curves(points, "linear"), "separation": separation(frames),
+        "beliefs": beliefs(frames), "strip": strip(alt.NamedData("series")),
     }  # fmt: skip
     return {name: vega.compiled(chart) for name, chart in charts.items()}

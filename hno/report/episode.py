@@ -3,13 +3,30 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, BeforeValidator, ConfigDict
 
+from hno.games.scene import Road
+
+BELIEVED = ("mean", "low", "high")
+"""What is said of a belief."""
 Array = Annotated[NDArray[np.float64], BeforeValidator(lambda value: np.asarray(value, dtype=np.float64))]
+
+
+class Scene(BaseModel):
+    """What is drawn around the players of a file of episodes, see `hno.games.scene`, and what they are called."""
+
+    model_config = ConfigDict(frozen=True, allow_inf_nan=False)
+
+    bodies: list[tuple[float, float]] = []
+    roads: list[Road] = []
+    controls: list[str] = []
+    players: list[str] = []
+    note: str = ""
 
 
 class Episode(BaseModel):
@@ -19,7 +36,9 @@ class Episode(BaseModel):
 
     theta: tuple[float, ...]
     kind: str = ""
-    """ "worst" (smallest clearance of its type) or "typical" (median clearance)."""
+    """ "worst" (most lost against the equilibrium), "typical" (of a median equilibrium) or "compared"."""
+    start: str = ""
+    """Equal for episodes from the same start state."""
     collided: bool = False
     clearance: float | None
     """Smallest value of -constraint."""
@@ -29,6 +48,12 @@ class Episode(BaseModel):
     """Time, s, (F,)."""
     positions: Array
     """m, (F, P, d)."""
+    speed: Array | None = None
+    """m/s, (F, P)."""
+    controls: Array | None = None
+    """(F, P, m)."""
+    value: Array | None = None
+    """V_i that the policy's value function gives to the rest of the episode, (F, P)."""
     radius: Array | None = None
     """Distance below which it is a collision, m, (F,); None where the constraint is no distance."""
     branch: Array | None = None
@@ -41,9 +66,24 @@ class Episode(BaseModel):
     """Positions along the equilibrium from the same start, m, (F, P, d)."""
 
     @property
-    def order(self) -> float:
-        """What episodes are ranked by: those without a clearance come last."""
-        return math.inf if self.clearance is None else self.clearance
+    def lost(self) -> float | None:
+        """Joint cost above the equilibrium's."""
+        return None if self.cost is None or self.label_cost is None else self.cost - self.label_cost
+
+    @property
+    def order(self) -> tuple[bool, float, float]:
+        """What episodes are ranked by, most lost first: collisions, then cost above the equilibrium's, then nearness.
+
+        An episode without costs, or without a clearance, is not known to have lost anything.
+        """
+        return lost_most(self.__dict__)
+
+
+def lost_most(content: Mapping[str, Any]) -> tuple[bool, float, float]:
+    """What episodes are ranked by, from their entry of episodes.json, see `Episode.order`."""
+    cost, best, near = (content.get(name) for name in ("cost", "label_cost", "clearance"))
+    lost = math.inf if cost is None or best is None else best - cost
+    return not content.get("collided"), lost, math.inf if near is None else near
 
 
 def episode(content: Any) -> Episode:
@@ -56,6 +96,9 @@ def episode(content: Any) -> Episode:
     arrays = {name: value for name, value in found if isinstance(value, np.ndarray)}
     places = (*found.t.shape, *found.positions.shape[1:])
     shape_of = {"belief": (*places[:2], 3), "positions": places, "label_positions": places}
+    shape_of |= {"speed": places[:2], "value": places[:2]}
+    if found.controls is not None:
+        shape_of["controls"] = (*places[:2], *found.controls.shape[2:3])
     wanted = {name: shape_of.get(name, places[:1]) for name in arrays}
     shapes = {name: array.shape for name, array in arrays.items()}
     if len(places) != 3 or places[2] not in (2, 3) or any(shape != wanted[name] for name, shape in shapes.items()):
@@ -97,10 +140,23 @@ def frames(found: Episode) -> list[dict[str, Any]]:
         if path is not None:
             columns |= {f"{prefix}{axis}": path[..., i] for i, axis in enumerate("xyz"[: path.shape[2]])}
     if found.belief is not None:
-        columns |= {name: found.belief[..., k] for k, name in enumerate(("mean", "low", "high"))}
+        columns |= {name: found.belief[..., k] for k, name in enumerate(BELIEVED)}
         columns["type"] = np.broadcast_to(found.theta, found.belief.shape[:2])
     lists = [[None] * len(found.t) if one is None else one.round(3).tolist() for one in columns.values()]
     return [{"frame": k, **dict(zip(columns, row, strict=True))} for k, row in enumerate(zip(*lists, strict=True))]
+
+
+def columns(found: Episode) -> dict[str, Any]:
+    """What the page plays, by name: t (F,), then by frame; None for what does not exist.
+
+    p and ghost are positions, of the episode and of the equilibrium; u controls, v speeds, value, distance, radius and
+    branch; mean, low and high what is believed of each player's type.
+    """
+    arrays = {"t": found.t, "p": found.positions, "ghost": found.label_positions, "u": found.controls}
+    arrays |= {"v": found.speed, "value": found.value, "distance": distances(found), "radius": found.radius}
+    arrays |= {name: None if found.belief is None else found.belief[..., k] for k, name in enumerate(BELIEVED)}
+    some = {name: None if one is None else one.round(3).tolist() for name, one in arrays.items()}
+    return some | {"branch": None if found.branch is None else found.branch.astype(int).tolist()}
 
 
 def whole(found: Episode, up: int) -> dict[str, float]:

@@ -52,6 +52,8 @@ def render(sweep: Sweep, refresh: float | None = None) -> str:
         "comparison": page_data.comparison(found),
         "curves": curves,
         "episodes": [page_data.playable(run, one) for run, one in played[:EPISODES]],
+        "scenes": page_data.scenes(runs),
+        "members": {card["id"]: [run.name for run in card["recipe"].runs] for card in cards},
         "charts": specifications(),
         "themes": {name: {"config": vega.chart_config(name), "signals": vega.signals(name)} for name in vega.THEMES},
         "refresh": refresh,
@@ -65,7 +67,8 @@ def render(sweep: Sweep, refresh: float | None = None) -> str:
     )  # fmt: skip
     environment.globals |= {"format": text, "verdicts": verdicts, "names_of": names_of, "type_table": type_table}
     return environment.get_template("page.html.j2").render(
-        sweep=sweep, recipes=found, games={game: (headline(own), own) for game, own in games.items()}, cards=cards,
+        sweep=sweep, recipes=found, single=len(runs) == 1,
+        games={game: (headline(own), own) for game, own in games.items()}, cards=cards,
         unfinished=[run for run in runs if not run.finished], filters={name: _choices(runs, name) for name in FILTERS},
         curve_games=sorted({entry["game"] for entry in curves}), recipe_table=recipe_table(found),
         run_table=run_table(runs), labels=label_tables(runs), sections=[entry for entry in sections if entry[1]],

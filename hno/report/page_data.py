@@ -6,8 +6,8 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from hno.evaluation.format import at, interval, percent, signed
-from hno.report.episode import Episode, closest, frames, whole
+from hno.evaluation.format import at, interval, number, percent, signed
+from hno.report.episode import Episode, closest, columns
 from hno.report.recipes import Recipe
 from hno.report.records import Run
 from hno.report.tables import Row, names_of
@@ -51,16 +51,16 @@ def _rates(recipe: Recipe) -> list[Row]:
 
 
 def learning_curves(recipes: Iterable[Recipe], runs: Iterable[Run]) -> list[Row]:
-    """Metrics of every run by step, thinned out evenly."""
+    """Metrics of every run by step, thinned out evenly; what was logged once is no curve."""
     names = {run.name: recipe.name for recipe in recipes for run in recipe.runs}
     return [
         {
             **names_of(run), "run": run.name,
             "recipe": names.get(run.name, " / ".join((run.operator, run.function, run.activation))),
-            "metrics": {name: _thinned(curve) for name, curve in sorted(run.curves.items())},
+            "metrics": {name: _thinned(curve) for name, curve in sorted(run.curves.items()) if len(curve) > 1},
         }
         for run in runs
-        if run.curves
+        if any(len(curve) > 1 for curve in run.curves.values())
     ]  # fmt: skip
 
 
@@ -70,7 +70,7 @@ def _thinned(curve: Sequence[tuple[int, float]]) -> list[tuple[int, float]]:
 
 
 def ranked(runs: Iterable[Run]) -> list[tuple[Run, Episode]]:
-    """Every episode: the worst of every run first, then a typical one of every run, then by clearance."""
+    """Every episode: the worst of every run first, then a typical one of every run, then by what was lost."""
     ordered = []
     for run in runs:
         places = {"worst": 0, "typical": 1}
@@ -79,15 +79,30 @@ def ranked(runs: Iterable[Run]) -> list[tuple[Run, Episode]]:
     return [(run, one) for *_, run, one in sorted(ordered, key=lambda entry: entry[:2])]
 
 
+def scenes(runs: Iterable[Run]) -> dict[str, Row]:
+    """What is drawn around players, by game; the first run of a game whose episodes say it decides."""
+    found: dict[str, Row] = {}
+    for run in runs:
+        if run.episodes and not found.get(run.game, {}).get("players"):
+            roads = [road._asdict() for road in run.scene.roads]
+            found[run.game] = {**run.scene.model_dump(), "roads": roads}
+    return found
+
+
 def playable(run: Run, found: Episode) -> Row:
     """What the page's player gets of an episode."""
     title = f"{run.name} · {at(found.theta)} · {found.kind}{' · collision' if found.collided else ''}"
     title += " · other side" * found.other_side
-    costs = ["n/a" if value is None else f"{value:.1f}" for value in (found.cost, found.label_cost)]
     near = clearance(found, run.constraint_unit)
-    said = f"{run.name}, types {at(found.theta)}, {found.kind}: {near}. "
-    said += f"Joint cost {costs[0]}, the equilibrium's {costs[1]}."
+    said = f"{run.name}, types {at(found.theta)}, {found.kind}: {near}. {_costs(found)}"
     said += " Passes on the other side than the equilibrium." * found.other_side
-    views = {name: whole(found, up) for up, name in enumerate(("top", "side")[: found.positions.shape[2] - 1], start=1)}
-    return {**names_of(run), "title": title, "said": said, "collided": found.collided, "closest": closest(found),
-            "frames": frames(found), "whole": views}  # fmt: skip
+    return {**names_of(run), **columns(found), "title": title, "said": said, "collided": found.collided,
+            "closest": closest(found), "run": run.name, "kind": found.kind, "start": found.start,
+            "theta": list(found.theta)}  # fmt: skip
+
+
+def _costs(found: Episode) -> str:
+    if found.lost is None:
+        return f"Joint cost {number(found.cost, 1)}, the equilibrium's {number(found.label_cost, 1)}."
+    costs = f"joint cost {number(found.cost, 1)}, the equilibrium's {number(found.label_cost, 1)}"
+    return f"Lost against the equilibrium: {number(found.lost, 1)} ({costs})."

@@ -13,12 +13,12 @@ from scipy.stats import t as student
 
 from hno.evaluation.format import NOT_AVAILABLE, counted
 from hno.evaluation.outcome import Pooled, pooled
+from hno.evaluation.starts import Starts, holm, paired
 from hno.report.records import Row, Run
+from hno.report.variants import chosen, matters, variants
 
-IGNORED = ("seed", "resume", "cache", "workers", "data.cache", "data.workers", "trainer.print_every", "trainer.threads")
-"""Settings that do not make another recipe."""
-SHOWN = 3
-"""Differing settings that are named in a recipe's label."""
+LEVEL = 0.05
+"""Of the test that tells two recipes apart."""
 Names = tuple[str, str, str, str]
 """Game, operator, function and activation."""
 Comparable = tuple[str, str, frozenset[tuple[float, ...]]]
@@ -101,7 +101,8 @@ class Recipe:
     def conditions(self) -> str:
         """At how many types episodes were played, and what was special."""
         sizes = sorted({len(run.table) for run in self.runs})
-        at = f"{' or '.join(map(str, sizes))} types" if sizes else NOT_AVAILABLE
+        at = counted(sizes[0], "type") if len(sizes) == 1 else f"{' or '.join(map(str, sizes))} types"
+        at = at if sizes else NOT_AVAILABLE
         return ", ".join(filter(None, (at, self.special)))
 
     @property
@@ -123,6 +124,11 @@ class Recipe:
     def pooled(self) -> Pooled:
         """Counts over all types and seeds; the worst type is that of the pooled counts."""
         return pooled(self.types)
+
+    @property
+    def outcomes(self) -> list[Mapping[tuple[float, ...], Starts]]:
+        """What came of single starts, by run and type."""
+        return [run.outcomes for run in self.runs]
 
     @property
     def rates(self) -> Spread | None:
@@ -148,23 +154,19 @@ def recipes(runs: Sequence[Run]) -> list[Recipe]:
     return [
         _recipe(names, variant, same)
         for names, group in sorted(groups.items())
-        for variant, same in zip(_variants([dict(key) for key in group]), group.values(), strict=True)
+        for variant, same in zip(_named(group), group.values(), strict=True)
     ]
+
+
+def _named(group: Mapping[tuple[tuple[str, str], ...], Sequence[Run]]) -> list[str]:
+    """What tells recipes of the same names apart: what was swept, if runs say it."""
+    return variants([chosen(same[0].overrides) for same in group.values()], [dict(key) for key in group])
 
 
 def _relevant(run: Run) -> dict[str, str]:
     """The settings that make a recipe; without a configuration, what the results say."""
-    chosen = {key: text for key, text in run.settings.items() if key not in IGNORED and not key.startswith("logger.")}
-    return chosen or {"steps": str(run.steps or NOT_AVAILABLE), "conditions": run.conditions}
-
-
-def _variants(settings: Sequence[Mapping[str, str]]) -> list[str]:
-    """What tells each of some settings from the others."""
-    keys = sorted({key for one in settings for key in one})
-    differing = [key for key in keys if len({one.get(key) for one in settings}) > 1]
-    more = [f"{len(differing) - SHOWN} more"] if len(differing) > SHOWN else []
-    ends = [{key: "/".join(one.get(key, NOT_AVAILABLE).split("/")[-3:]) for key in differing} for one in settings]
-    return [", ".join([f"{key}={one[key]:.40}" for key in differing[:SHOWN]] + more) for one in ends]
+    some = {key: text for key, text in run.settings.items() if matters(key)}
+    return some or {"steps": str(run.steps or NOT_AVAILABLE), "conditions": run.conditions}
 
 
 def _recipe(names: Names, variant: str, runs: Sequence[Run]) -> Recipe:
@@ -192,8 +194,29 @@ def headline(found: Iterable[Recipe]) -> Recipe | None:
     return min(found, key=lambda one: (bool(one.special), -len(one.comparable[2]), *_order(one)), default=None)
 
 
-def rivals(chosen: Recipe, found: Iterable[Recipe]) -> list[Recipe]:
-    """Recipes that may be compared with the chosen one and whose interval of the collision rate overlaps its own."""
-    bounds = chosen.pooled.interval
-    others = (other for other in found if other is not chosen and other.comparable == chosen.comparable)
-    return [other for other in others if bounds and other.pooled.interval and other.pooled.interval[0] <= bounds[1]]
+class Rival(NamedTuple):
+    """Another recipe that may be compared with a chosen one."""
+
+    recipe: Recipe
+    p_value: float | None
+    """Of the paired test, see `hno.evaluation.starts.paired`, adjusted by Holm; None where starts were not kept."""
+    told_apart: bool
+    """Whether it is below 0.05; without it, whether the intervals of both rates have nothing in common."""
+
+
+def rivals(chosen: Recipe, found: Iterable[Recipe]) -> list[Rival]:
+    """All others that may be compared with a recipe, and whether the episodes tell them apart from it."""
+    others = [other for other in found if other is not chosen and other.comparable == chosen.comparable]
+    others = [other for other in others if chosen.pooled.interval and other.pooled.interval]
+    tests = [paired(chosen.outcomes, other.outcomes) for other in others]
+    adjusted = iter(holm([test.p_value for test in tests if test]))
+    p_values = [next(adjusted) if test else None for test in tests]
+    return [
+        Rival(other, p, _apart(chosen, other) if p is None else p < LEVEL)
+        for other, p in zip(others, p_values, strict=True)
+    ]
+
+
+def _apart(one: Recipe, other: Recipe) -> bool:
+    (low, high), (least, most) = one.pooled.interval or (0, 1), other.pooled.interval or (0, 1)
+    return high < least or most < low

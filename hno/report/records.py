@@ -12,7 +12,8 @@ from pydantic import BaseModel, ConfigDict, SkipValidation, TypeAdapter, Validat
 from hno.evaluation.closed_loop import TypeRow
 from hno.evaluation.format import NOT_AVAILABLE
 from hno.evaluation.outcome import Outcome
-from hno.report.episode import Episode
+from hno.evaluation.starts import Starts
+from hno.report.episode import Episode, Scene
 
 Curves = dict[str, list[tuple[int, float]]]
 """Metric -> step and value."""
@@ -61,8 +62,14 @@ class Run(BaseModel):
     """The configuration, dotted names."""
     curves: SkipValidation[Curves] = {}
     episodes: SkipValidation[list[Episode]] = []
+    scene: SkipValidation[Scene] = Scene()
+    """What is drawn around the players of its episodes."""
+    outcomes: SkipValidation[dict[tuple[float, ...], Starts]] = {}
+    """What came of single starts, by type; empty where it was not kept."""
     command: SkipValidation[str | None] = None
     """The command line that repeats it."""
+    overrides: SkipValidation[tuple[str, ...]] = ()
+    """What this command line chose, in its order."""
     notes: SkipValidation[list[str]] = []
     """What could not be read, and why."""
 

@@ -14,7 +14,8 @@ from typing import Any, NamedTuple, TypeVar
 from yaml import YAMLError, safe_load  # type: ignore[import-untyped]  # yaml has no annotations
 
 from hno.data.folders import LOCK, held
-from hno.report.episode import episode
+from hno.evaluation.starts import starts_from
+from hno.report.episode import Scene, episode
 from hno.report.records import Curves, Run, sentence, type_row
 
 T = TypeVar("T")
@@ -93,7 +94,7 @@ def _runs(folder: Path, name: str) -> list[Run]:
     models = content.pop("models", None) or [{}]
     if not (isinstance(models, list) and all(isinstance(model, dict) for model in models)):
         raise ValueError(f"{RESULTS} is not hno's: models is no list of objects")
-    shared = {key: value for key, value in content.items() if key not in ("episodes", "comparison")}
+    shared = {key: value for key, value in content.items() if key not in ("episodes", "outcomes", "comparison")}
     names = [name] if len(models) == 1 else [f"{name} [{k}]" for k in range(len(models))]
     return [
         _run(folder, name, {**(shared if k else content), **model})
@@ -126,21 +127,32 @@ def read_json(path: Path) -> dict[str, Any]:
 def _run(folder: Path, name: str, content: Mapping[str, Any]) -> Run:
     """A model with what lies beside its results; what cannot be read there is left out and noted."""
     try:
-        run = Run.model_validate({**content, "episodes": []})
+        run = Run.model_validate({**content, "episodes": [], "outcomes": {}})
     except ValueError as error:
         raise ValueError(f"{RESULTS} is not hno's: {sentence(error)}") from error
-    notes, metrics, episodes = list[str](), folder / METRICS, content.get("episodes")
+    notes, metrics = list[str](), folder / METRICS
     found: dict[str, Any] = {"name": name, "notes": notes, "settings": _flat(run.config or {})}
     if "checkpoint" in found["settings"]:
         found["settings"]["checkpoint"] = str(run.checkpoint)
     found["command"] = _command(folder / ".hydra" / "hydra.yaml")
+    found["overrides"] = tuple(shlex.split(found["command"] or "")[2:])
     found["table"] = _each(run.table, type_row, "row of the table", notes)
     with _noted(notes, "no learning curves"):
         found["curves"] = _curves(metrics) if metrics.exists() else {}
-    with _noted(notes, "no episodes"):  # a name inside the folder, whatever the file says
-        played = read_json(folder / Path(episodes).name).get("episodes") if isinstance(episodes, str) else []
-        found["episodes"] = _each(played, episode, "episode", notes)
+    with _noted(notes, "no episodes"):
+        played = _beside(folder, content.get("episodes"))
+        found["episodes"] = _each(played.get("episodes", []), episode, "episode", notes)
+        found["scene"] = Scene.model_validate(played.get("scene", {}))
+    with _noted(notes, "no outcomes of single starts"):
+        types = _beside(folder, content.get("outcomes")).get("types", [])
+        starts = _each(types, starts_from, "list of starts", notes)
+        found["outcomes"] = {one.theta: one for one in starts}
     return run.model_copy(update=found)
+
+
+def _beside(folder: Path, name: Any) -> dict[str, Any]:
+    """A file that results name: one inside their folder, whatever they say; empty without a name."""
+    return read_json(folder / Path(name).name) if isinstance(name, str) else {}
 
 
 @contextmanager

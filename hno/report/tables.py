@@ -61,7 +61,9 @@ def _labels(found: Spread | None) -> str:
 
 
 def _range(found: Spread | None) -> str:
-    return NOT_AVAILABLE if found is None else f"{percent(found.low)} to {percent(found.high)}"
+    if found is None or found.seeds == 1:
+        return NOT_AVAILABLE
+    return f"{percent(found.low)} to {percent(found.high)}"
 
 
 FILTERS = (*NAMES, "seed")

@@ -44,6 +44,7 @@ def chart_config(theme: str) -> dict[str, Any]:
     lines = dict.fromkeys(("domainColor", "gridColor", "tickColor"), colors["line"])
     return {
         "background": "transparent",
+        "aria": False,  # a chart has one name, that of its place in the page
         "axis": {**lines, "gridOpacity": 0.7, "tickSize": 4, "labelPadding": 4},
         "legend": {"symbolType": "circle"},
         "text": {"font": FONT, "fontSize": 11},
@@ -76,7 +77,7 @@ def compiled(chart: alt.TopLevelMixin) -> dict[str, Any]:
 
 def svg(chart: alt.TopLevelMixin) -> str:
     """A chart with data as SVG, in light colours."""
-    config = {**chart_config("light"), "background": "white", "aria": False}
+    config = {**chart_config("light"), "background": "white"}
     return vl_convert.vegalite_to_svg({**chart.to_dict(), "config": config}, vl_version=VERSION)
 
 

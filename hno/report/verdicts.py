@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from hno.evaluation.format import NOT_AVAILABLE, at, counted, interval, percent, signed
 from hno.evaluation.outcome import Pooled
 from hno.report.episode import Episode
-from hno.report.recipes import Recipe, Spread, rivals
+from hno.report.recipes import Recipe, Rival, Spread, rivals
 from hno.report.records import Run
 from hno.report.runs import Sweep
 
@@ -53,19 +53,59 @@ def quality(found: Pooled) -> str:
     return "safe" if found.collisions == 0 else ("rare" if found.rate <= 0.01 else "unsafe")
 
 
+LEFT_OUT = {
+    "inevitable": "whose equilibrium collides",
+    "marginal": "whose equilibrium passes closer than the clearance",
+    "unsolved": "without a converged equilibrium",
+}
+"""Why a start does not count, by the entry of the table that counts them."""
+
+
+def denominator(recipe: Recipe) -> str:
+    """How many of the starts count that were played, and why the others do not."""
+    rows = [row for run in recipe.runs for row in run.table]
+    starts, safe = (sum(row[name] for row in rows) for name in ("starts", "safe_starts"))
+    each = f" ({recipe.seeds} from the same starts)" if len(recipe.runs) > 1 else ""
+    left = [(sum(row[name] for row in rows), why) for name, why in LEFT_OUT.items()]
+    said = [f"{count:,} {why}" for count, why in left if count]
+    rest = starts - safe - sum(count for count, _ in left)
+    said += [f"{rest:,} for reasons that the table does not name"] if rest > 0 else []
+    chosen = {run.settings.get("evaluation.safe", run.settings.get("safe")) for run in recipe.runs} == {"true"}
+    drawn = " They were drawn until so many were safe; those that were not are not in the table." if chosen else ""
+    if starts == safe:
+        return f"All {starts:,} starts count{each}.{drawn}"
+    return f"{safe:,} of {starts:,} starts count{each}; left out: {', '.join(said)}.{drawn}"
+
+
 def verdict(recipe: Recipe, recipes: Sequence[Recipe]) -> str:
     """A judgement of a recipe in which something was played, and the others that it is not told apart from."""
     whole = recipe.pooled
     judged = {"safe": "No start collides", "rare": "Collisions are rare", "unsafe": "Not safe"}[quality(whole)]
     worst = next((one for one in recipe.types if one["theta"] == whole.worst_theta), None)
-    told = f" Worst type {at(worst['theta'])}: {worst['collisions']} of {worst['safe_starts']:,}." if worst else ""
-    others = [other.name for other in rivals(recipe, recipes)]
-    names = ", ".join(others[:3]) + (f" and {len(others) - 3} more" if len(others) > 3 else "")
-    rest = f" Not told apart from {names}: the intervals overlap." if others else ""
+    told = f" Worst type {at(worst['theta'])}: {worst['collisions']:,} of {worst['safe_starts']:,}." if worst else ""
     return (
         f"{judged} ({recipe.seeds}, {recipe.conditions}): 95 % interval {interval(whole.interval)}.{told} "
-        f"Joint cost above the equilibrium's: {over_seeds(recipe.excess)}.{rest}"
+        f"Joint cost above the equilibrium's: {over_seeds(recipe.excess)}.{told_apart(rivals(recipe, recipes))}"
     )
+
+
+def told_apart(found: Sequence[Rival]) -> str:
+    """From which other recipes the chosen one is told apart, and by which test; nothing without others."""
+    if not found:
+        return ""
+    same = [one for one in found if not one.told_apart]
+    names = ", ".join(_named(one) for one in same[:3]) + (f" and {len(same) - 3} more" if len(same) > 3 else "")
+    tested = any(one.p_value is not None for one in found)
+    by = ["exact sign test of the same starts (one seed: McNemar's), p after Holm, level 5 %"] if tested else []
+    by += ["no outcome of single starts was kept, so no paired test: whether the intervals overlap"] * any(
+        one.p_value is None for one in found
+    )
+    apart = f" Told apart from {len(found) - len(same)} of {counted(len(found), 'other recipe')}"
+    return f"{apart}{'; not from ' + names if same else ''} ({'; '.join(by)})."
+
+
+def _named(one: Rival) -> str:
+    return one.recipe.name + ("" if one.p_value is None else f" (p = {one.p_value:.2g})")
 
 
 def why(run: Run) -> str:

@@ -95,10 +95,13 @@ def test_wandb_gets_pictures_and_the_worst_stored_episode(command: Command, monk
     )
     run = command("train", *SMOKE, "trainer.max_steps=1", "logger=wandb")
     assert run.code == 0, run.text
-    assert titles == ["narrow_road / hno / potential / sin\nsmallest clearance, -0.20 m at (1,1)"]
+    said = "most lost against the equilibrium at (1,1), clearance -0.20 m"
+    assert titles == [f"narrow_road / hno / potential / sin\n{said}"]
     kept = {path.name.split("_")[0] for path in run.folder.glob("wandb/offline-run-*/files/media/*/*.png")}
     assert kept == {"worst", "rollout", "collision"}
-    summary = offline_run(run.folder).summary
+    kept_run = offline_run(run.folder)
+    summary = kept_run.summary
+    assert any("lr" in name for row in kept_run.history for name in row)
     assert summary.keys() >= {"worst_episode/filenames", "rollout/filenames", "collision_map/filenames"}
     assert (summary["types/nrows"], summary["test/worst_theta"]) == (1, "1,1")
 
@@ -114,10 +117,22 @@ def test_a_logger_that_refuses_costs_a_warning_not_the_run(tmp_path: Path, caplo
     assert float(last_row(tmp_path)["collision_rate/1,1"]) == 0.1
 
 
-def test_the_worst_episode_is_one_that_is_not_finite(tmp_path: Path) -> None:
-    kept = [{"clearance": clearance} for clearance in (0.3, None, -0.2)]
-    (tmp_path / "episodes.json").write_text(json.dumps({"episodes": kept}))
-    assert media.worst_episode({"episodes": "episodes.json"}, tmp_path) == {"clearance": None}
+def test_the_worst_episode_lost_most_and_a_collision_is_worse_than_any_cost(tmp_path: Path) -> None:
+    def worst(*kept: dict[str, Any]) -> dict[str, Any] | None:
+        (tmp_path / "episodes.json").write_text(json.dumps({"episodes": kept}))
+        return media.worst_episode({"episodes": "episodes.json"}, tmp_path)
+
+    near, dear = ({"clearance": c, "cost": cost, "label_cost": 10.0} for c, cost in ((0.01, 11.0), (2.0, 90.0)))
+    struck = {"clearance": None, "cost": None, "label_cost": 10.0, "collided": True}
+    assert worst(near, dear) == dear
+    assert worst(near, struck, dear) == struck
+    assert worst() is None
+
+
+def test_the_table_of_types_has_numbers_in_its_cells() -> None:
+    row = media._flat(type_row((1, 2.5), 3, 100))
+    assert (row["types"], row["theta_1"], row["theta_2"], row["collisions"], row["rate"]) == ("1,2.5", 1, 2.5, 3, 0.03)
+    assert all(value is None or isinstance(value, (bool, int, float)) for name, value in row.items() if name != "types")
 
 
 def test_a_picture_that_fails_costs_a_warning_not_the_run(

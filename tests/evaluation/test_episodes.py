@@ -2,16 +2,18 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from safetensors.torch import load_file
 from torch import Tensor
 
 from hno.control.belief import Believing
 from hno.control.rollout import Player
 from hno.evaluation.closed_loop import play
-from hno.evaluation.episodes import FRAMES, episodes, together
+from hno.evaluation.episodes import FRAMES, episodes, together, write_paths
 from hno.evaluation.outcome import numbers_of, outcome
 from hno.games import Game, make
 from hno.games.kinematics import separation
@@ -50,19 +52,61 @@ def sets() -> list[Extremal]:
     ]
 
 
-def test_the_worst_and_the_typical_start_that_count_are_kept(sets: list[Extremal]) -> None:
-    """Distances are 1.8, 0.8, 0.1, 1.0 and 1.6, 0.7, 1.4; the radius of a type is 0.2 + 0.2 theta."""
+def test_the_worst_lost_most_and_the_typical_has_a_median_equilibrium(sets: list[Extremal]) -> None:
+    """Distances are 1.8, 0.8, 0.1, 1.0 and 1.6, 0.7, 1.4; the radius of a type is 0.2 + 0.2 theta.
+
+    Where one collides it is the worst, whatever it costs; where none does it is the one with the largest excess cost,
+    whether or not players come close.
+    """
     game = Walkers()
     kept = kept_of(game, straight, sets)
     assert (kept["players"], kept["dimensions"]) == (2, 2)
-    found = [(e["theta"][0], e["kind"], e["distance"], e["collided"]) for e in kept["episodes"]]
+    found = [(e["theta"][0], e["kind"], e["collided"], e["start"].split("/")[1]) for e in kept["episodes"]]
+    (_, first), (_, second) = ((found, paths) for found, paths in play(game, straight, sets[:2], 0.02))
+    lost = second.cost - sets[1].cost.float()
+    medians = [
+        int(one.cost[keep].argsort()[len(keep) // 2])
+        for one, keep in zip(sets, ([1, 2, 3, 4], [0, 1, 2]), strict=False)
+    ]
+    assert bool(first.collided[3])
+    assert not second.collided.any()
     assert found == [
-        (1.0, "worst", pytest.approx(0.1, abs=2e-3), True),
-        (1.0, "typical", pytest.approx(1.0, abs=2e-3), False),
-        (2.0, "worst", pytest.approx(0.7, abs=2e-3), False),
-        (2.0, "typical", pytest.approx(1.4, abs=2e-3), False),
+        (1.0, "worst", True, "3"),
+        (1.0, "typical", bool(first.collided[1 + medians[0]]), str(1 + medians[0])),
+        (2.0, "worst", False, str(int(lost.argmax()))),
+        (2.0, "typical", False, str(medians[1])),
     ]
     assert all(radius == pytest.approx(0.4, abs=1e-3) for radius in kept["episodes"][0]["radius"])
+
+
+def test_policies_that_play_the_same_starts_have_episodes_of_the_same_ones(sets: list[Extremal]) -> None:
+    def aside(tau: Tensor, x: Tensor, theta: Tensor) -> Tensor:
+        return torch.tensor([3.0, 0.2]).expand(len(x), 2, 2)
+
+    def kept(policy: Player, also: Sequence[int]) -> list[Any]:
+        evaluation = evaluation_of(Walkers(), policy, sets)
+        return episodes(evaluation, *next(play(Walkers(), policy, sets, 0.02)), also)
+
+    first = kept(straight, ())
+    second = kept(aside, [one.row for one in first])
+    assert {one.content["start"] for one in first} <= {one.content["start"] for one in second}
+    assert len({one.row for one in second}) == len(second) or second[0].row == second[1].row
+
+
+def test_states_controls_and_values_are_kept_at_every_step(sets: list[Extremal], tmp_path: Path) -> None:
+    evaluation = evaluation_of(Walkers(), straight, sets)
+    label, played = next(play(Walkers(), straight, sets, 0.02))
+    kept = episodes(evaluation, label, played)
+    write_paths(kept, tmp_path / "paths.safetensors")
+    found = load_file(tmp_path / "paths.safetensors")
+    for k, one in enumerate(kept):
+        torch.testing.assert_close(found[f"{k}.x"], played.x[one.row])
+        torch.testing.assert_close(found[f"{k}.u"], played.u[one.row])
+        assert found[f"{k}.value"].shape == (len(played.t), 2)
+        torch.testing.assert_close(found[f"{k}.label_x"], label.x[one.row].float())
+        frames = len(one.content["t"])
+        assert [len(one.content[name]) for name in ("speed", "controls", "value")] == [frames] * 3
+        assert torch.tensor(one.content["speed"]).sub(4.0).abs().max() < 1e-2, "they walk at 4 m/s"
 
 
 def test_an_episode_shows_where_players_go_and_where_the_equilibrium_goes(sets: list[Extremal]) -> None:
@@ -72,6 +116,7 @@ def test_an_episode_shows_where_players_go_and_where_the_equilibrium_goes(sets: 
     frames = len(episode["t"])
     assert FRAMES / 2 < frames <= FRAMES + 2
     kept = separation(torch.tensor(episode["positions"])).amin(-1)
+    assert episode["start"].endswith("/3")
     assert float(kept.min()) == pytest.approx(float(separation(game.positions(played.x[3])).min()), abs=2e-3)
     assert (episode["t"][0], episode["t"][-1]) == (0.0, pytest.approx(game.horizon))
     for name in ("positions", "label_positions"):
@@ -119,7 +164,7 @@ def test_a_broken_episode_is_the_worst(sets: list[Extremal]) -> None:
     """What is not finite counts as a collision, and stays readable JSON once the writer has replaced it."""
 
     def broken(found: Sequence[Extremal], paths: Sequence[Trajectory]) -> Any:
-        paths[0].clearance[1] = torch.nan
+        paths[0].clearance[1], paths[0].value[1] = torch.nan, torch.nan
         return zip(found, paths, strict=True)
 
     worst = kept_of(Walkers(), straight, sets, broken)["episodes"][0]
@@ -137,7 +182,7 @@ def test_three_dimensions_and_the_size_of_the_file() -> None:
 
     kept = kept_of(game, hover, found)
     assert kept["dimensions"] == 3
-    assert len(json.dumps(kept)) / len(kept["episodes"]) < 8000
+    assert len(json.dumps(kept)) / len(kept["episodes"]) < 12000
 
 
 def test_one_player_alone_has_episodes_without_a_radius() -> None:
@@ -184,8 +229,8 @@ def test_beliefs_along_an_episode_are_those_that_were_played_with(monkeypatch: p
         patch.setattr(Believing, "observe", watched)
         evaluation = evaluation_of(Walkers(), policy, labels, learns="mean", noise=0.1)
         played = next(play(Walkers(), policy, labels, 0.02, evaluation.condition.disturbance))[1]
-    kept = episodes(evaluation, labels[0], played)[0]
-    row = int(played.distance.argmin())
+    first = episodes(evaluation, labels[0], played)[0]
+    kept, row = first.content, first.row
     grid = Believing(revealing, game=Walkers()).grid[0].double()
     means = torch.tensor(kept["belief"])[..., 0]
     assert means[0].tolist() == [2.0, 2.0]

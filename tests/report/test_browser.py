@@ -96,7 +96,8 @@ def test_everything_is_drawn_without_a_word_or_a_request(browser):
         plot = page.locator(f"[data-chart={chart}]:visible").first
         plot.scroll_into_view_if_needed()
         plot.locator("svg, canvas").wait_for()
-    page.locator("#top svg").wait_for(state="attached")
+    page.locator("#top canvas").wait_for(state="attached")
+    page.locator("#strips svg").first.wait_for(state="attached")
 
 
 def test_filters_hide_what_does_not_match_and_live_in_the_address(browser):
@@ -152,34 +153,103 @@ def test_the_animation_plays_and_pauses(browser):
     page.select_option("#speed", "2")
     page.click("#play")
     assert page.get_attribute("#play", "aria-label") == "Pause"
-    browser.until("Number(document.querySelector('#scrub').value) > 5")
+    browser.until("Number(document.querySelector('#scrub').value) > 0.3")
     browser.until("document.querySelector('#play').getAttribute('aria-label') === 'Play'")
     assert page.input_value("#scrub") == page.get_attribute("#scrub", "max")
 
 
-def test_the_discs_move_and_turn_red_in_a_collision(browser):
-    page = browser.page
-    page.select_option(
-        "#episode", label=next(t for t in page.locator("#episode option").all_inner_texts() if "collision" in t)
+def pixels(page, name: str, selector: str = "#top canvas") -> int:
+    """How many pixels of the view have a colour of the page, or nearly so."""
+    script = """([selector, name]) => {
+        const canvas = document.querySelector(selector), probe = document.createElement('canvas').getContext('2d');
+        probe.fillStyle = getComputedStyle(document.documentElement).getPropertyValue(`--${name}`);
+        probe.fillRect(0, 0, 1, 1);
+        const want = probe.getImageData(0, 0, 1, 1).data;
+        const copy = Object.assign(document.createElement('canvas'), {width: canvas.width, height: canvas.height});
+        const read = copy.getContext('2d', {willReadFrequently: true});
+        read.drawImage(canvas, 0, 0);
+        const all = read.getImageData(0, 0, canvas.width, canvas.height).data;
+        let count = 0;
+        for (let k = 0; k < all.length; k += 4)
+            count += all[k + 3] > 60 && [0, 1, 2].every((c) => Math.abs(all[k + c] - want[c]) < 30);
+        return count;
+    }"""
+    return page.evaluate(script, [selector, name])
+
+
+def move_to(page, time: float) -> None:
+    page.evaluate(
+        """time => { const scrub = document.querySelector('#scrub');
+        scrub.value = time; scrub.dispatchEvent(new Event('input')); }""",
+        time,
     )
-    page.locator("#top svg").wait_for()
 
-    def fills(frame: int) -> list[str]:
-        page.evaluate(
-            """frame => { const scrub = document.querySelector('#scrub');
-            scrub.value = frame; scrub.dispatchEvent(new Event('input')); }""",
-            frame,
-        )
-        page.wait_for_timeout(100)
-        script = """[...document.querySelectorAll('#top .mark-symbol path')]
-            .filter(disc => disc.getBoundingClientRect().width > 9).map(disc => disc.getAttribute('fill'))"""
-        return page.evaluate(script)
 
-    danger = page.evaluate("getComputedStyle(document.documentElement).getPropertyValue('--danger')").strip()
-    browser.until("document.querySelectorAll('#top .mark-symbol path').length > 0")
-    far, near = fills(0), fills(25)
-    assert danger not in far
-    assert near == [danger, danger]
+def titles(page) -> list[str]:
+    return page.locator("#episode option").all_inner_texts()
+
+
+def test_discs_are_red_exactly_in_a_collision(browser):
+    page = browser.page
+    page.select_option("#episode", label=next(title for title in titles(page) if "collision" in title))
+    page.locator("#top canvas").wait_for()
+    move_to(page, 0)
+    assert pixels(page, "danger") == 0
+    move_to(page, 1.5)
+    assert pixels(page, "danger") > 50
+
+
+def test_between_frames_players_move_on(browser):
+    """Sixty times a second: the picture of two times that lie between the same two frames differs."""
+    page = browser.page
+    shots = []
+    for time_of in (0.901, 0.915):
+        move_to(page, time_of)
+        shots.append(page.evaluate("document.querySelector('#top canvas').toDataURL()"))
+    assert shots[0] != shots[1]
+
+
+def test_a_cell_of_a_heat_map_opens_its_episodes_and_the_address_keeps_the_view(browser):
+    page = browser.page
+    card = page.locator(".map:visible").first
+    card.scroll_into_view_if_needed()
+    card.locator("svg").wait_for()
+    cell = card.locator(".mark-rect path").first
+    cell.scroll_into_view_if_needed()
+    cell.click(force=True)
+    browser.until("document.querySelector('#types').value !== ''")
+    theta = page.input_value("#types")
+    assert all(f" {theta} " in title for title in titles(page))
+    page.click("#next")
+    move_to(page, 0.75)
+    chosen = page.locator("#episode option:checked").inner_text()
+    page.reload()
+    assert page.locator("#episode option:checked").inner_text() == chosen
+    assert page.input_value("#types") == theta
+    browser.until("document.querySelector('#clock').textContent.startsWith('0.75 s')")
+
+
+def test_two_policies_from_one_start_are_drawn_over_each_other(context, tmp_path):
+    for number in range(2):
+        results = make_results("lane_change", "sno", "tanh", number, np.random.default_rng(0), GRID5[:1])
+        folder = write_run(tmp_path / f"run_{number}", results)
+        entry = make_episode("lane_change", (1.0, 1.0), "typical", 0.3 + number, frames=9) | {"start": "same/3"}
+        scene = {"bodies": [[4.5, 1.8], [4.5, 1.8]], "roads": [{"axis": 0, "edges": [0, 8], "marks": [4]}]}
+        scene |= {"players": ["left one", "right one"], "note": "Bodies are drawn for the eye."}
+        (folder / "episodes.json").write_text(json.dumps({"episodes": [entry], "scene": scene}))
+    write_page(load(tmp_path), tmp_path / "report.html")
+    opened = Browser(context, (tmp_path / "report.html").as_uri())
+    assert opened.page.locator("#beside option").all_inner_texts() == ["nothing", "run_1"]
+    assert "left one, θ = 1" in opened.page.inner_text("#who")
+    assert "Bodies are drawn for the eye." in opened.page.inner_text("#drawn")
+    alone = opened.page.evaluate("document.querySelector('#top canvas').toDataURL()")
+    opened.page.select_option("#beside", label="run_1")
+    assert opened.page.evaluate("document.querySelector('#top canvas').toDataURL()") != alone
+    assert "Beside it: run_1" in opened.page.inner_text("#said")
+    opened.page.reload()
+    assert "Beside it: run_1" in opened.page.inner_text("#said")
+    assert opened.said == []
+    opened.page.close()
 
 
 def test_the_clock_says_which_branch_is_played(context, tmp_path):
@@ -205,9 +275,9 @@ def test_the_keyboard_reaches_everything(browser):
     browser.until("document.querySelector('#play').getAttribute('aria-label') === 'Pause'")
     page.keyboard.press("Enter")
     page.keyboard.press("Tab")
-    before = int(page.input_value("#scrub"))
+    before = float(page.input_value("#scrub"))
     page.keyboard.press("ArrowRight")
-    assert int(page.input_value("#scrub")) == before + 1
+    assert float(page.input_value("#scrub")) == pytest.approx(before + 0.01)
     page.focus("#recipes th button")
     page.keyboard.press("Space")
     assert page.locator("#recipes th").first.get_attribute("aria-sort") == "ascending"
@@ -241,7 +311,7 @@ def test_it_fits_the_width_in_light_and_in_dark(browser, width, scheme, tmp_path
     page.emulate_media(color_scheme=scheme)
     page.set_viewport_size({"width": width, "height": 900})
     page.reload()
-    page.locator("#top svg").wait_for(state="attached")
+    page.locator("#top canvas").wait_for(state="attached")
     assert page.evaluate("document.documentElement.scrollWidth") == width
     paper = page.evaluate("getComputedStyle(document.body).backgroundColor")
     bright = sum(int(part) for part in paper[4:-1].split(",")) > 3 * 128

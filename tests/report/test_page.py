@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from hno.report import page_data
-from hno.report.episode import closest, episode, frames
+from hno.report.episode import closest, columns, episode
 from hno.report.page import EPISODES, embedded, render, write_page
 from hno.report.recipes import recipes
 from hno.report.runs import load
@@ -100,7 +100,7 @@ def test_nothing_from_a_file_becomes_markup(tmp_path, small_page):
     }  # fmt: skip
     folder = write_run(tmp_path / "0", {**results, "game": HOSTILE})
     metrics = folder / "csv" / "metrics.csv"
-    metrics.write_text(f'"{HOSTILE.replace(chr(34), chr(34) * 2)}",step\n1,2\n')
+    metrics.write_text(f'"{HOSTILE.replace(chr(34), chr(34) * 2)}",step\n1,2\n2,4\n')
     write_run(tmp_path / "1", {**results, "seed": 1, "status": "failed", "reason": HOSTILE, "operator": "sno"})
     hostile = render(load(tmp_path))
     count = [len(re.findall(r"<script", text.split('id="data">')[0])) for text in (hostile, small_page)]
@@ -194,13 +194,46 @@ def test_a_page_is_written_whole_or_not_at_all(small_sweep, tmp_path, monkeypatc
 
 def test_the_player_gets_what_the_file_holds():
     found = episode(make_episode("drone", (1.0, 5.0), "worst", -0.1))
-    rows = frames(found)
-    for axis, name in enumerate("xyz"):
-        assert np.abs([frame[name] for frame in rows] - found.positions[..., axis]).max() <= 0.00051
-        assert np.abs([frame[f"label_{name}"] for frame in rows] - found.label_positions[..., axis]).max() <= 0.00051
-    gaps = [frame["distance"] - frame["radius"] for frame in rows]
+    shown = columns(found)
+    assert np.abs(np.array(shown["p"]) - found.positions).max() <= 0.00051
+    assert np.abs(np.array(shown["ghost"]) - found.label_positions).max() <= 0.00051
+    gaps = (np.array(shown["distance"]) - shown["radius"]).tolist()
     assert min(gaps) == pytest.approx(-0.1, abs=2e-3)
     assert gaps.index(min(gaps)) == closest(found)
+
+
+def test_the_headline_says_how_many_starts_count_and_why_the_others_do_not(tmp_path):
+    results = make_results("drone", "sno", "tanh", 0, np.random.default_rng(0), GRID5[:1])
+    counts = {"starts": 20, "safe_starts": 12, "inevitable": 5, "marginal": 2, "unsolved": 1, "collisions": 3}
+    for number in range(2):
+        table = [row((1.0, 1.0), 3, 12) | counts]
+        write_run(tmp_path / str(number), results | {"table": table, "seed": number}, extras=False)
+    said = (
+        "24 of 40 starts count (2 seeds from the same starts); left out: 10 whose equilibrium collides, "
+        "4 whose equilibrium passes closer than the clearance, 2 without a converged equilibrium."
+    )
+    assert said in Page(render(load(tmp_path))).texts
+
+
+def test_a_single_run_has_no_furniture_of_a_sweep(tmp_path, small_page):
+    write_run(tmp_path, make_results("drone", "sno", "tanh", 0, np.random.default_rng(0)))
+    alone = Page(render(load(tmp_path)))
+    ids = {attributes.get("id"): attributes for _, attributes in alone.elements}
+    assert "recipes" not in ids
+    assert "hidden" in ids["filters"]
+    assert not any(attributes.get("data-chart") == "comparison" for _, attributes in alone.elements)
+    assert not any("1 runs" in text or "1 types" in text for text in alone.texts)
+    assert "recipes" in {attributes.get("id") for _, attributes in Page(small_page).elements}
+
+
+def test_what_was_logged_once_is_no_curve(tmp_path):
+    folder = write_run(tmp_path, make_results("drone", "sno", "tanh", 0, np.random.default_rng(0)))
+    lines = (folder / "csv" / "metrics.csv").read_text().splitlines()
+    lines = [lines[0] + ",seconds/labels", *(line + "," for line in lines[1:-1]), lines[-1] + ",3.0"]
+    (folder / "csv" / "metrics.csv").write_text("\n".join(lines) + "\n")
+    (curve,) = Page(render(load(tmp_path))).data["curves"]
+    assert "seconds/labels" not in curve["metrics"]
+    assert all(len(points) > 1 for points in curve["metrics"].values())
 
 
 @pytest.mark.parametrize(("players", "radius"), [(1, None), (2, None), (3, 1.0)])
@@ -212,8 +245,8 @@ def test_episodes_of_any_number_of_players_and_without_a_distance_are_shown(tmp_
     folder = write_run(tmp_path, make_results("own", "sno", "tanh", 0, np.random.default_rng(0), GRID5[:1]))
     (folder / "episodes.json").write_text(json.dumps({"episodes": [entry]}))
     (shown,) = Page(render(load(folder))).data["episodes"]
-    assert len(shown["frames"][0]["x"]) == players
-    assert (shown["frames"][0]["distance"] is None) == (players == 1)
+    assert len(shown["p"][0]) == players
+    assert (shown["distance"] is None) == (players == 1)
     assert ("collision radius" in shown["said"]) == (radius is not None)
 
 
@@ -225,8 +258,8 @@ def test_branches_and_the_other_side_are_told(tmp_path):
     (folder / "episodes.json").write_text(json.dumps({"episodes": entries}))
     page = Page(render(load(folder)))
     worst, typical = page.data["episodes"]
-    assert [frame["branch"] for frame in worst["frames"]] == [0, 0, 1, 1, 1]
-    assert {frame["branch"] for frame in typical["frames"]} == {None}
+    assert worst["branch"] == [0, 0, 1, 1, 1]
+    assert typical["branch"] is None
     assert [("other side" in one["title"], "other side" in one["said"]) for one in (worst, typical)] == [
         (True, True),
         (False, False),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 from collections.abc import Sequence
@@ -167,17 +168,16 @@ def test_failed_and_unfinished_runs_are_told_but_not_counted(tmp_path):
     assert (rate(recipe), recipe.failed, recipe.unfinished) == ((1, 200), 1, 1)
 
 
-def recipe_names(found: Sequence[Recipe]) -> list[str]:
-    return [recipe.operator for recipe in found]
-
-
 def test_the_best_has_the_lowest_rate_and_names_its_rivals(tmp_path):
     for operator, collisions in (("sno", (0, 1)), ("hno", (0, 2)), ("other", (40, 60))):
         write(tmp_path / operator, 0, collisions, operator=operator)
     found = recipes(loaded(tmp_path))
     (chosen,) = best(found)
     assert chosen.operator == "sno"
-    assert recipe_names(rivals(chosen, found)) == ["hno"]
+    assert [(one.recipe.operator, one.told_apart) for one in rivals(chosen, found)] == [
+        ("hno", False),
+        ("other", True),
+    ]
 
 
 def test_other_conditions_of_play_are_not_compared(tmp_path):
@@ -202,3 +202,64 @@ def test_runs_without_a_configuration_are_told_apart_by_their_steps(tmp_path):
         del results["config"]
         write_run(tmp_path / str(k), results, extras=False)
     assert [recipe.variant for recipe in recipes(loaded(tmp_path))] == ["steps=10", "steps=20"]
+
+
+def started(folder: Path, name: str, collided: str, key: str = "same", counted: str = "") -> None:
+    """A run whose single starts are kept."""
+    write(folder / name, 0, (collided.count("1"), 0), operator=name)
+    content = json.loads((folder / name / "results.json").read_text()) | {"outcomes": "outcomes.json"}
+    (folder / name / "results.json").write_text(json.dumps(content))
+    one = {"theta": FIRST, "key": key, "counted": counted or "1" * len(collided), "collided": collided}
+    (folder / name / "outcomes.json").write_text(json.dumps({"types": [one]}))
+
+
+@pytest.mark.parametrize(
+    ("other", "key", "p_value"),
+    [
+        ("1" * 8 + "0" * 92, "same", 2 / 2**8),
+        ("0" * 100, "same", 1.0),
+        ("1" + "0" * 99, "same", 1.0),
+        ("1" * 8 + "0" * 92, "others", None),
+    ],
+)
+def test_recipes_are_told_apart_start_by_start(tmp_path, other, key, p_value):
+    """McNemar's exact test: of starts from which only one collides, either is as likely. Other starts have no pairs."""
+    started(tmp_path, "hno", "0" * 100)
+    started(tmp_path, "sno", other, key)
+    found = recipes(loaded(tmp_path))
+    (rival,) = rivals(best(found)[0], found)
+    assert rival.p_value == (None if p_value is None else pytest.approx(p_value))
+    if p_value is not None:
+        assert rival.told_apart == (p_value < 0.05)
+
+
+def test_starts_that_do_not_count_do_not_tell_recipes_apart(tmp_path):
+    counted = "0" * 8 + "1" * 92
+    started(tmp_path, "hno", "0" * 100, counted=counted)
+    started(tmp_path, "sno", "1" * 8 + "0" * 92, counted=counted)
+    found = recipes(loaded(tmp_path))
+    assert rivals(found[0], found)[0].p_value == 1.0
+
+
+def test_what_was_swept_names_recipes_in_its_order_and_no_two_alike(tmp_path):
+    """The example of a sweep over four keys; the alphabet would begin with another."""
+    for number, (optimizer, sampler, lr) in enumerate(
+        itertools.product(("soap", "adam"), ("mixed", "uniform"), (1, 2))
+    ):
+        config = {"optimizer": {"name": optimizer, "lr": lr, "a": optimizer}, "data": {"a": sampler}, "seed": 0}
+        write(tmp_path / str(number), 0, (0, 0), config=config)
+        task = [f"optimizer={optimizer}", f"sampler={sampler}", f"++optimizer.lr={lr}", "experiment=smoke", "seed=0"]
+        hydra = {"job": {"name": "train"}, "overrides": {"task": task}}
+        (tmp_path / str(number) / ".hydra" / "hydra.yaml").write_text(json.dumps({"hydra": hydra}))
+    names = [one.variant for one in recipes(loaded(tmp_path))]
+    assert len(set(names)) == 8
+    assert names[0] == "optimizer=soap, sampler=mixed, optimizer.lr=1"
+    assert len({texts[1] for texts in recipe_table(recipes(loaded(tmp_path))).texts}) == 8
+
+
+def test_recipes_that_no_command_line_tells_apart_are_named_by_their_settings(tmp_path):
+    for number in range(9):
+        bits = {f"k{place}": number >> place & 1 for place in range(4)}
+        write(tmp_path / str(number), 0, (0, 0), config={**bits, "seed": 0})
+    names = [one.variant for one in recipes(loaded(tmp_path))]
+    assert len(set(names)) == 9

@@ -46,7 +46,15 @@ function drawHeat(host) {
   const cells = DATA.maps[host.dataset.of];
   const columns = new Set(cells.map((cell) => cell.theta[0])).size;
   const step = Math.max(13, Math.min(38, Math.floor((host.clientWidth - 44) / columns)));
-  draw(host, "heat", { cells }, { x_step: step, y_step: step, small: step < 26, bound: $("shown").value });
+  const values = { x_step: step, y_step: step, small: step < 26, bound: $("shown").value };
+  draw(host, "heat", { cells }, values).then((view) =>
+    view?.addEventListener("click", (_event, item) => {
+      const theta = item?.datum?.theta;
+      if (!theta || !$("player")) return;
+      choose_type(`(${theta.join(", ")})`, DATA.members[host.dataset.of]);
+      $("episodes").scrollIntoView();
+    }),
+  );
 }
 
 function drawComparison(host) {
@@ -60,8 +68,23 @@ function drawCurves(host) {
   const points = told.flatMap(({ run, recipe, metrics }) =>
     metrics[metric].map(([step, value]) => ({ run, recipe, step, value })),
   );
-  const scale = points.length && points.every((point) => point.value > 0) ? "log" : "linear";
-  draw(host, scale, { points }, {}, "canvas");
+  host.closest("figure").hidden = !points.length;
+  if (!points.length) return;
+  const scale = points.every((point) => point.value > 0) ? "log" : "linear";
+  draw(host, scale, { points }, { metric: `${metric}, ${meaning(metric)}${scale === "log" ? ", log scale" : ""}` }, "canvas");
+}
+
+/** What a metric's numbers are, by the beginning of its name. */
+function meaning(metric) {
+  const known = [
+    ["seconds/", "s"],
+    ["closed_loop/collision_rate", "collisions per safe start"],
+    ["closed_loop/excess", "joint cost above the equilibrium's, share of it"],
+    ["val/", "error on held-out labels, share of their size"],
+    ["lr", "learning rate"],
+    ["loss/", "training loss, weighted, no unit"],
+  ];
+  return (known.find(([start]) => metric.startsWith(start)) ?? ["", "as logged"])[1];
 }
 
 const kinds = { heat: drawHeat, comparison: drawComparison, curves: drawCurves };
@@ -113,9 +136,22 @@ if (metric) {
   const names = [...new Set(DATA.curves.flatMap((curve) => Object.keys(curve.metrics)))].sort();
   metric.append(...names.map((name) => element("option", { value: name, textContent: name })));
   metric.value = ["closed_loop/collision_rate", "val/costate_error", "loss/total"].reduce((best, name) => (names.includes(name) ? name : best), names[0]);
-  metric.addEventListener("change", () => redraw("curves"));
+  metric.addEventListener("change", () => {
+    remember({ metric: metric.value });
+    redraw("curves");
+  });
 }
-$("shown")?.addEventListener("change", () => redraw("heat"));
+$("shown")?.addEventListener("change", () => {
+  remember({ shown: $("shown").value });
+  redraw("heat");
+});
+recallers.push(() => {
+  for (const select of [metric, $("shown")]) {
+    const wanted = select && remembered()[select.id];
+    if (wanted && [...select.options].some((option) => option.value === wanted)) select.value = wanted;
+  }
+  redraw("curves", "heat");
+});
 
 const everything = () => redraw(...Object.keys(kinds));
 let width = innerWidth;

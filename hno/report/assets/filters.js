@@ -1,4 +1,4 @@
-/** Filters live in the address (#game=drone&seed=0), so that a reload or a shared link keeps them. */
+/** Filters, and what each part shows, live in the address (#game=drone&seed=0), which a reload or a link keeps. */
 const form = $("filters");
 const KEYS = [...form.querySelectorAll("select")].map((select) => select.name);
 const state = Object.fromEntries(KEYS.map((key) => [key, ""]));
@@ -6,19 +6,42 @@ const listeners = [];
 
 const matches = (names) => KEYS.every((key) => !state[key] || names[key] === undefined || String(names[key]) === state[key]);
 
+/** What else the address keeps, such as an episode and a metric; each part of the page reads its own. */
+const kept = {};
+const recallers = [];
+const remembered = () => kept;
+const addressed = () => new URLSearchParams(location.hash.includes("=") ? location.hash.slice(1) : "");
+
+function writeAddress() {
+  const all = { ...Object.fromEntries(KEYS.map((key) => [key, state[key]])), ...kept };
+  const chosen = new URLSearchParams(Object.entries(all).filter(([, value]) => value));
+  history.replaceState(null, "", `#${chosen}`);
+}
+
+function remember(entries) {
+  Object.assign(kept, entries);
+  if (ready) writeAddress();
+}
+
+let ready = false;
 function readAddress() {
-  const chosen = new URLSearchParams(location.hash.includes("=") ? location.hash.slice(1) : "");
+  const chosen = addressed();
+  ready = false;
+  for (const key of Object.keys(kept)) delete kept[key];
   for (const key of KEYS) {
     const known = [...form.elements[key].options].some((option) => option.value === chosen.get(key));
     state[key] = form.elements[key].value = known ? chosen.get(key) : "";
   }
+  const others = Object.fromEntries([...chosen].filter(([key]) => !KEYS.includes(key)));
   apply();
+  Object.assign(kept, others);
+  for (const recall of recallers) recall();
+  ready = true;
 }
 
 function choose() {
   for (const key of KEYS) state[key] = form.elements[key].value;
-  const chosen = new URLSearchParams(KEYS.filter((key) => state[key]).map((key) => [key, state[key]]));
-  history.replaceState(null, "", `#${chosen}`);
+  writeAddress();
   apply();
 }
 
@@ -31,7 +54,8 @@ function apply() {
   }
   const rows = all("#runs tbody tr");
   const left = rows.filter((row) => !row.hasAttribute("data-out")).length;
-  $("matching").textContent = left === rows.length ? `${left} runs` : `${left} of ${rows.length} runs`;
+  const runs = `${rows.length} run${rows.length === 1 ? "" : "s"}`;
+  $("matching").textContent = left === rows.length ? runs : `${left} of ${runs}`;
   for (const listener of listeners) listener();
 }
 
