@@ -11,6 +11,7 @@ from hno.games.base import games
 from hno.games.box import Box
 from hno.games.collision import CollisionAvoidance
 from hno.games.kinematics import GRAVITY, double_integrator_drift
+from hno.games.plane import Axis, Plane
 
 
 @final
@@ -26,6 +27,9 @@ class Drone(CollisionAvoidance):
         horizon: length of the game, s.
     """
 
+    state_names, state_units = ("px", "py", "pz", "vx", "vy", "vz"), ("m",) * 3 + ("m/s",) * 3
+    relative_names = ("gap_x", "gap_y", "gap_z")
+    plane = Plane(Axis("gap_x", -5, 5), Axis("gap_y", -5, 5))
     positive = ("width",)
 
     def __init__(self, width: float = 5.0, radius: float = 0.5, horizon: float = 4.0) -> None:

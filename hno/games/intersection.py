@@ -10,6 +10,7 @@ from torch import Tensor
 from hno.games.affine import ControlAffineGame
 from hno.games.base import games
 from hno.games.box import Box
+from hno.games.plane import Axis, Plane
 
 
 @final
@@ -28,6 +29,8 @@ class Intersection(ControlAffineGame):
         horizon: length of the game, s.
     """
 
+    state_names, state_units = ("d", "v"), ("m", "m/s")
+    plane = Plane(Axis("d_1", 20, 50), Axis("d_2", 20, 50))
     positive = ("growth", "speed")
     distance_constraints = False
     potential = True

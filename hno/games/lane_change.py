@@ -11,6 +11,7 @@ from hno.games.base import games
 from hno.games.box import Box
 from hno.games.cars import Cars
 from hno.games.kinematics import DEGREE
+from hno.games.plane import Axis, Plane
 
 
 @final
@@ -26,6 +27,7 @@ class LaneChange(Cars):
     """
 
     roles = (0, 1)
+    plane = Plane(Axis("gap", -15, 15), Axis("offset", -6, 6))
     positive = ("speed",)
     lanes: Tensor
 

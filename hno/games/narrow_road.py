@@ -11,6 +11,7 @@ from hno.games.base import games
 from hno.games.box import Box
 from hno.games.cars import Cars
 from hno.games.kinematics import DEGREE
+from hno.games.plane import Axis, Plane
 
 
 @final
@@ -26,6 +27,7 @@ class NarrowRoad(Cars):
         horizon: length of the game, s.
     """
 
+    plane = Plane(Axis("gap", -10, 40), Axis("offset", -4, 4))
     positive = ("length", "speed")
 
     def __init__(
