@@ -126,7 +126,7 @@ def read_json(path: Path) -> dict[str, Any]:
 def _run(folder: Path, name: str, content: Mapping[str, Any]) -> Run:
     """A model with what lies beside its results; what cannot be read there is left out and noted."""
     try:
-        run = Run.model_validate({**content, "episodes": []})
+        run = Run.model_validate({**content, "episodes": [], "landscape": None})
     except ValueError as error:
         raise ValueError(f"{RESULTS} is not hno's: {sentence(error)}") from error
     notes, metrics, episodes = list[str](), folder / METRICS, content.get("episodes")
@@ -134,6 +134,8 @@ def _run(folder: Path, name: str, content: Mapping[str, Any]) -> Run:
     if "checkpoint" in found["settings"]:
         found["settings"]["checkpoint"] = str(run.checkpoint)
     found["command"] = _command(folder / ".hydra" / "hydra.yaml")
+    if isinstance(beside := content.get("landscape"), str) and (folder / Path(beside).name).is_file():
+        found["landscape"] = folder / Path(beside).name
     found["table"] = _each(run.table, type_row, "row of the table", notes)
     with _noted(notes, "no learning curves"):
         found["curves"] = _curves(metrics) if metrics.exists() else {}
