@@ -15,6 +15,7 @@ from omegaconf import DictConfig
 from hno.cli import launch
 from hno.cli.arguments import Arguments
 from hno.cli.config import read
+from hno.cli.landscapes import write_landscape
 from hno.cli.logs import label_progress, use_threads
 from hno.cli.media import draw_typical
 from hno.cli.results import Results, write_json
@@ -23,6 +24,7 @@ from hno.cli.settings import Episodes, EvaluateSettings
 from hno.control.exported import ExportedPolicy, is_exported, load_exported
 from hno.control.rollout import control_steps
 from hno.data.labels import Request, default_cache, labels_for, safe_labels_for
+from hno.data.states import equilibria_from
 from hno.evaluation.closed_loop import CollisionTable, play
 from hno.evaluation.comparison import PairedComparison, check_same_game
 from hno.evaluation.conditions import TIES, table_condition
@@ -108,7 +110,7 @@ def describe(
     Labels of the starts depend on the game, the types and the options `starts`, `seed`, `safe` and `clearance` alone:
     every model meets the same ones. Equal starts have the same labels, the same object.
     """
-    game, types = models[0][1].game, list(dict.fromkeys(types))
+    game, types, place = models[0][1].game, list(dict.fromkeys(types)), Path(cache or default_cache())
     solver = functools.partial(safe_labels_for, clearance=options["clearance"]) if options["safe"] else labels_for
 
     @functools.cache
@@ -116,10 +118,19 @@ def describe(
         starts = min(options["starts"], TIES) if ties else options["starts"]
         kind = starts, options["seed"], "test", widen, symmetric, ties
         requests = [Request(theta, *kind) for theta in types]
-        return solver(game, requests, Path(cache or default_cache()), workers=workers, report=label_progress())[0]
+        return solver(game, requests, place, workers=workers, report=label_progress())[0]
 
+    equilibria = functools.partial(equilibria_from, cache=place, workers=workers, report=label_progress())
     return [
-        Evaluation(name, policy, policy.types, types, options, lambda condition: solve(*condition.starts))
+        Evaluation(
+            name,
+            policy,
+            policy.types,
+            types,
+            options,
+            lambda condition: solve(*condition.starts),
+            equilibria=equilibria,
+        )
         for name, policy in models
     ]
 
@@ -134,13 +145,15 @@ def evaluate(settings: EvaluateSettings, results: Results) -> None:
     ]
     results.update(**models[0])
     played = list[Evaluation]()
-    for model, evaluation in zip(models, evaluations, strict=True):
+    for number, (model, evaluation) in enumerate(zip(models, evaluations, strict=True)):
         log.info("evaluation of %s", evaluation.name)
         found, model["table"] = play_starts(evaluation, results)
         played.append(found)
         for name, content in run_sections(found, results):
             model[name] = content
             results.update(**models[0])
+        model |= write_landscape(found, results, number)
+        results.update(**models[0])
     if len(models) > 1:
         results.update(models=models, comparison=PairedComparison().compute(played))
 

@@ -115,6 +115,9 @@ class Episodes(Settings):
     delay: Count
     ntk: bool
     ntk_rows: Size
+    landscape: bool
+    landscape_truth: Count
+    off_labels: Count
 
 
 class EvaluationSettings(Episodes):

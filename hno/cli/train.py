@@ -14,6 +14,7 @@ from hno.cli.arguments import Arguments
 from hno.cli.build import build, check, how_to_train, record_of
 from hno.cli.config import configured
 from hno.cli.evaluate import describe, play_starts, unseen_types
+from hno.cli.landscapes import write_landscape
 from hno.cli.logs import StepBar, StepLines, label_progress, loggers, use_threads
 from hno.cli.media import publish
 from hno.cli.results import Results
@@ -75,6 +76,7 @@ def train(settings: TrainSettings, results: Results) -> None:
     played, _ = play_starts(evaluation, results)
     for name, content in run_sections(played, results):
         results.update(**{name: content})
+    results.update(**write_landscape(played, results))
     publish(fitted.trainer.loggers, results.content, folder, fitted.trainer.global_step)
 
 

@@ -63,7 +63,7 @@ class Slice(NamedTuple):
     @property
     def violation(self) -> NDArray[np.float64]:
         """The largest constraint of all players, (U, A): its zero level is the boundary of the violation set."""
-        return self.constraint.max((-1, -2))  # type: ignore[no-any-return]  # NumPy's stubs say Any
+        return self.constraint.max((-1, -2))
 
 
 class Grid(NamedTuple):

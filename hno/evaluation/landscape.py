@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Mapping
-from pathlib import Path
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -14,12 +13,10 @@ from numpy.typing import NDArray
 
 from hno.control import Feedback
 from hno.control.exported import ExportedPolicy
-from hno.control.slices import Slice, base_state, chosen_plane, take
-from hno.data.labels import Report
-from hno.data.states import equilibria_from
+from hno.control.slices import Side, Slice, base_state, chosen_plane, take
 from hno.export.page_program import page_program
 from hno.games import Game
-from hno.types import Status
+from hno.types import Extremal, Status
 
 log = logging.getLogger(__name__)
 
@@ -31,21 +28,22 @@ DIGITS = 5
 """Significant digits of written numbers."""
 
 
-def landscape(
-    policy: Feedback,
-    truth: int = 0,
-    cache: Path | None = None,
-    workers: int | None = None,
-    report: Report | None = None,
-) -> dict[str, Any]:
+FAILURES = ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError
+"""What networks from outside may raise where they are traced: that costs the page its sliders alone."""
+Equilibria = Callable[..., Extremal]
+"""As `hno.data.states.equilibria_from`, from game, states, types and time to go."""
+
+
+def landscape(policy: Feedback, truth: int = 0, equilibria: Equilibria | None = None) -> dict[str, Any]:
     """JSON content of a landscape.
 
     Args:
         policy: whose.
         truth: points along each side of the game's own slice at which equilibria are solved; 0 for none.
-        cache: folder of label files; needed for a truth.
-        workers: as of `equilibria_from`.
-        report: likewise.
+        equilibria: solves them.
+
+    Raises:
+        ValueError: the game has no slice.
     """
     game = policy.game
     plane = chosen_plane(game, None, None, None)
@@ -55,9 +53,9 @@ def landscape(
         "program": program, "reason": reason, "players": game.players, "states": game.state_dim,
         "horizon": game.horizon, "unit": game.constraint_unit, "potential": policy.operator.potential,
         "coordinates": _coordinates(game), "start": base_state(game).flatten().tolist(), "theta": _box(game.type_box),
-        "plane": {"across": _side(own, 0), "up": _side(own, 1), "at": dict(plane.at)},
+        "plane": {"across": _ends(own.across), "up": _ends(own.up), "at": dict(plane.at)},
         "python": _arrays(own),
-        "truth": _truth(game, own, cache, workers, report) if truth and cache else None,
+        "truth": _truth(game, own, equilibria) if truth and equilibria else None,
     }  # fmt: skip
 
 
@@ -67,7 +65,7 @@ def _program(policy: Feedback) -> tuple[dict[str, Any] | None, str | None]:
         return None, "an exported controller has no graph"
     try:
         return page_program(policy.operator), None
-    except Exception as error:  # a network from outside may fail in any way, and costs the page its sliders alone
+    except FAILURES as error:
         reason = f"{type(error).__name__}: {error}".split("\n")[0][:300]
         log.warning("The page shows the default slice alone, since this controller has no graph: %s", reason)
         return None, reason
@@ -89,9 +87,8 @@ def _box(box: Any) -> list[list[float]]:
     return [box.lo.tolist(), box.hi.tolist()]
 
 
-def _side(own: Slice, k: int) -> dict[str, Any]:
-    values = own[k].values
-    return {"name": own[k].name, "lo": float(values[0]), "hi": float(values[-1])}
+def _ends(side: Side) -> dict[str, Any]:
+    return {"name": side.name, "lo": float(side.values[0]), "hi": float(side.values[-1])}
 
 
 def _arrays(own: Slice) -> dict[str, Any]:
@@ -106,13 +103,11 @@ def _plain(part: NDArray[np.float64]) -> list[float | None]:
     return [float(f"{one:.{DIGITS}g}") if np.isfinite(one) else None for one in part.ravel().tolist()]
 
 
-def _truth(
-    game: Game, own: Slice, cache: Path, workers: int | None, report: Report | None
-) -> dict[str, Any]:
+def _truth(game: Game, own: Slice, equilibria: Equilibria) -> dict[str, Any]:
     """What equilibria say at the states of a slice, as `_arrays`; null where none was found."""
     x0 = torch.from_numpy(own.x).flatten(0, 1)
     theta = torch.tensor(own.theta, dtype=torch.float64).expand(len(x0), -1)
-    found = equilibria_from(game, x0, theta, own.tau, cache, workers=workers, report=report)
+    found = equilibria(game, x0, theta, own.tau)
     solved = found.status == Status.CONVERGED
     parts: dict[str, Any] = {
         "value": found.value[:, 0],

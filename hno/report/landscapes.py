@@ -13,10 +13,11 @@ from hno.report.tables import Row, names_of
 
 SIGNALS = {
     "low": -10, "high": 0, "scheme": "viridis", "levels": [], "columns": 2, "rows": 2, "x_title": "", "y_title": "",
-    "x_ends": [0, 1], "y_ends": [0, 1], "ink": "#000", "muted": "#000", "danger": "#f00", "title": "",
+    "x_ends": [0, 1], "y_ends": [0, 1], "ink": "#000", "muted": "#000", "danger": "#f00", "title": "", "arrow": "#fff",
+    "level": [], "coarse_points": 2,
 }  # fmt: skip
 """What the page says of a chart beside its data, and colours."""
-PIXEL = "[width / (columns - 1), height / (rows - 1)]"
+PIXEL = "[width / ({} - 1), height / ({} - 1)]"
 """Distance between two points of a grid."""
 
 
@@ -35,14 +36,16 @@ def chart() -> dict[str, Any]:
     """A heat map with level sets, the boundary of the violation set and arrows, as Vega.
 
     Its data: "grid", "shape" and "barrier" are one raster each, {width, height, values} from the top left: the values,
-    the same without NaN, and the constraint; "arrows" have ends x, y, x2, y2 in coordinates and an angle, degrees.
+    the same without NaN, and the constraint; "arrows" have ends x, y, x2, y2 in coordinates and an angle, degrees;
+    "family" has a raster for every one of several types.
     """
     return {
         "padding": 4,
         "signals": [
             {"name": "width", "value": 300}, {"name": "height", "value": 260},
             *({"name": name, "value": value} for name, value in SIGNALS.items()),
-            {"name": "pixel", "update": PIXEL},
+            {"name": "pixel", "update": PIXEL.format("columns", "rows")},
+            {"name": "coarse", "update": PIXEL.format("coarse_points", "coarse_points")},
         ],
         "data": [
             {"name": "grid", "values": []},
@@ -54,12 +57,17 @@ def chart() -> dict[str, Any]:
             {"name": "barrier", "values": []},
             {"name": "boundary", "source": "barrier", "transform": [_contour([0])]},
             {"name": "arrows", "values": []},
+            {"name": "family", "values": []},
+            {"name": "sets", "source": "family", "transform": [
+                {**_contour({"signal": "level"}, "coarse"), "field": "raster"}]},
         ],
         "scales": [
             {"name": "x", "type": "linear", "domain": {"signal": "x_ends"}, "range": "width", "zero": False},
             {"name": "y", "type": "linear", "domain": {"signal": "y_ends"}, "range": "height", "zero": False},
             {"name": "color", "type": "symlog", "domain": [{"signal": "low"}, {"signal": "high"}],
              "range": {"scheme": {"signal": "scheme"}}},
+            {"name": "types", "type": "linear", "domain": {"data": "family", "field": "theta"}, "zero": False,
+             "range": {"scheme": "plasma", "extent": [0.1, 0.9]}},
         ],
         "axes": [
             {"scale": "x", "orient": "bottom", "title": {"signal": "x_title"}, "tickCount": 6},
@@ -70,13 +78,13 @@ def chart() -> dict[str, Any]:
         "marks": [{
             "type": "group", "clip": True,
             "encode": {"update": {"width": {"signal": "width"}, "height": {"signal": "height"}}},
-            "marks": [_image(), _lines("contours", "ink", 0.8, 0.45), _lines("boundary", "danger", 2.5, 1), *_arrows()],
+            "marks": [_image(), _lines("contours", "ink", 0.8, 0.45), _lines("boundary", "danger", 2.5, 1), *_arrows(), _sets()],
         }],
     }  # fmt: skip
 
 
-def _contour(levels: Any) -> dict[str, Any]:
-    place = {"scale": {"signal": "pixel"}, "translate": {"signal": "[-pixel[0] / 2, -pixel[1] / 2]"}}
+def _contour(levels: Any, pixel: str = "pixel") -> dict[str, Any]:
+    place = {"scale": {"signal": pixel}, "translate": {"signal": f"[-{pixel}[0] / 2, -{pixel}[1] / 2]"}}
     return {"type": "isocontour", "thresholds": levels, "zero": False, **place}
 
 
@@ -96,15 +104,22 @@ def _lines(data: str, color: str, width: float, opacity: float) -> dict[str, Any
     return {"type": "path", "from": {"data": data}, "encode": {"update": update}, "transform": transform}
 
 
+def _sets() -> dict[str, Any]:
+    """One level set for each of several types."""
+    update = {"stroke": {"scale": "types", "field": "theta"}, "strokeWidth": {"value": 2.2}}
+    transform = [{"type": "geopath", "field": "datum.contour"}]
+    return {"type": "path", "from": {"data": "sets"}, "encode": {"update": update}, "transform": transform}
+
+
 def _arrows() -> list[dict[str, Any]]:
     ends = {
         "x": {"scale": "x", "field": "x"}, "y": {"scale": "y", "field": "y"},
         "x2": {"scale": "x", "field": "x2"}, "y2": {"scale": "y", "field": "y2"},
     }  # fmt: skip
-    shaft = {"stroke": {"value": "white"}, "strokeWidth": {"value": 1.4}, "strokeOpacity": {"value": 0.9}}
+    shaft = {"stroke": {"signal": "arrow"}, "strokeWidth": {"value": 1.4}, "strokeOpacity": {"value": 0.9}}
     head = {
         "x": ends["x2"], "y": ends["y2"], "shape": {"value": "triangle"}, "size": {"value": 22},
-        "angle": {"field": "angle"}, "fill": {"value": "white"}, "fillOpacity": {"value": 0.95},
+        "angle": {"field": "angle"}, "fill": {"signal": "arrow"}, "fillOpacity": {"value": 0.95},
     }  # fmt: skip
     return [
         {"type": "rule", "from": {"data": "arrows"}, "encode": {"update": {**ends, **shaft}}},

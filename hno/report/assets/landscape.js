@@ -1,5 +1,5 @@
 /** Slices of a controller, evaluated here from its graph; without a graph, Python's own values on the game's slice. */
-const [FINE, COARSE, ARROWS] = [33, 17, 9];
+const [FINE, COARSE, ARROWS, TYPES] = [33, 17, 9, 5];
 /** Largest difference between the values of this page and Python's, relative to |value| + median |value|. */
 const TOLERANCE = 0.01;
 const land = { content: null, evaluate: null, waiting: null, error: null, turn: 0, across: "", up: "", tau: 0, theta: [], at: {} };
@@ -125,14 +125,38 @@ function arrows({ push }, n, width, height) {
     .map(({ x, y, dx, dy }) => ({ x, y, x2: x + (dx * length) / sx, y2: y + (dy * length) / sy, angle: (Math.atan2(dx, dy) * 180) / Math.PI }));
 }
 
+/** Rasters of equal types from the low to the high end of the type box, whose level sets are drawn in one picture. */
+function family(n, shown) {
+  const { theta, players } = land.content;
+  const kept = land.theta;
+  const found = Array.from({ length: TYPES }, (_, k) => {
+    const share = k / (TYPES - 1);
+    land.theta = Array.from({ length: players }, (_, i) => theta[0][i] + share * (theta[1][i] - theta[0][i]));
+    return { theta: land.theta[0], raster: raster(column(evaluated(n), shown), n)[0] };
+  });
+  land.theta = kept;
+  return found;
+}
+
+function showLevels(found) {
+  const select = $("land-level");
+  const before = select.value;
+  const texts = found.map((level) => String(Number(level.toPrecision(3))));
+  select.replaceChildren(element("option", { value: "", textContent: "none" }), ...texts.map((text) => element("option", { value: text, textContent: text })));
+  select.value = texts.includes(before) ? before : "";
+  select.disabled = !land.evaluate;
+}
+
 function surface(host, values, n, given, barrier, moved) {
   const width = Math.max(160, Math.min(560, $(host).clientWidth - 130));
   const height = Math.round(Math.min(320, Math.max(200, width * 0.7)));
   const sides = ["across", "up"].map((side) => coordinate(land[side]));
   const [x_title, y_title] = sides.map(({ name, unit }) => (unit ? `${name} [${unit}]` : name));
-  const known = values.map((one) => (Number.isFinite(one) ? one : given.low));
+  const known = values.map((one) => (Number.isFinite(one) ? one : given.hole));
   const data = { grid: raster(values.map((one) => one ?? NaN), n), shape: raster(known, n), barrier: raster(barrier, n), arrows: moved ? arrows(moved, n, width, height) : [] };
-  const signals = { width, height, columns: n, rows: n, x_title, y_title, x_ends: ends(land.across), y_ends: ends(land.up), ...given };
+  const level = moved && land.evaluate ? $("land-level").value : "";
+  if (level !== "") Object.assign(data, { family: family(COARSE, chosen()) });
+  const signals = { width, height, columns: n, rows: n, coarse_points: COARSE, x_title, y_title, x_ends: ends(land.across), y_ends: ends(land.up), level: level === "" ? [] : [Number(level)], ...given };
   return draw($(host), "landscape", data, signals, "canvas");
 }
 
@@ -142,7 +166,8 @@ function scaleOf(values, signed) {
   let [low, high] = [Math.min(...finite), Math.max(...finite)];
   if (signed) [low, high] = [-Math.max(-low, high), Math.max(-low, high)];
   if (!(low < high)) [low, high] = [low - 1, high + 1];
-  return { low, high, levels: levels(low, high), scheme: signed ? "blueorange" : "viridis" };
+  const [scheme, arrow] = signed ? ["blueorange", "#222"] : ["viridis", "#fff"];
+  return { low, high, levels: levels(low, high), scheme, arrow, hole: signed ? 0 : low };
 }
 
 const atDefault = () => {
@@ -165,6 +190,7 @@ function drawLandscape(coarse = false) {
   const barrier = violation(found, n * n);
   const wanted = compared ? truthOf(shown) : [];
   const scale = { ...scaleOf([...values, ...wanted], shown.signed), title: shown.title };
+  showLevels(scale.levels);
   for (const name of ["truth", "error"]) $(`land-${name}-box`).hidden = !compared;
   surface("land-learned", values, n, scale, barrier, found);
   if (compared) {
@@ -280,7 +306,7 @@ function listLandscapes() {
 if ($("landscape")) {
   listeners.push(listLandscapes);
   $("land-run").addEventListener("change", loadLandscape);
-  $("land-shown").addEventListener("change", () => drawLandscape());
+  for (const name of ["shown", "level"]) $(`land-${name}`).addEventListener("change", () => drawLandscape());
   $("land-arrows").addEventListener("change", () => drawLandscape());
   $("land-reset").addEventListener("click", resetLandscape);
   for (const side of ["across", "up"]) {
