@@ -14,7 +14,7 @@ from hno.report.tables import Row, names_of
 SIGNALS = {
     "low": -10, "high": 0, "scheme": "viridis", "levels": [], "columns": 2, "rows": 2, "x_title": "", "y_title": "",
     "x_ends": [0, 1], "y_ends": [0, 1], "ink": "#000", "muted": "#000", "danger": "#f00", "title": "", "arrow": "#fff",
-    "level": [], "coarse_points": 2,
+    "level": [], "coarse_points": 2, "type_ends": [0, 1],
 }  # fmt: skip
 """What the page says of a chart beside its data, and colours."""
 PIXEL = "[width / ({} - 1), height / ({} - 1)]"
@@ -66,7 +66,7 @@ def chart() -> dict[str, Any]:
             {"name": "y", "type": "linear", "domain": {"signal": "y_ends"}, "range": "height", "zero": False},
             {"name": "color", "type": "symlog", "domain": [{"signal": "low"}, {"signal": "high"}],
              "range": {"scheme": {"signal": "scheme"}}},
-            {"name": "types", "type": "linear", "domain": {"data": "family", "field": "theta"}, "zero": False,
+            {"name": "types", "type": "linear", "domain": {"signal": "type_ends"}, "zero": False,
              "range": {"scheme": "plasma", "extent": [0.1, 0.9]}},
         ],
         "axes": [
@@ -78,7 +78,10 @@ def chart() -> dict[str, Any]:
         "marks": [{
             "type": "group", "clip": True,
             "encode": {"update": {"width": {"signal": "width"}, "height": {"signal": "height"}}},
-            "marks": [_image(), _lines("contours", "ink", 0.8, 0.45), _lines("boundary", "danger", 2.5, 1), *_arrows(), _sets()],
+            "marks": [
+                _image(), _lines("contours", "ink", 0.8, 0.45), _lines("boundary", "danger", 2.5, 1), *_arrows(),
+                _sets(),
+            ],
         }],
     }  # fmt: skip
 

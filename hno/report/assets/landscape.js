@@ -88,8 +88,19 @@ function truthOf(shown) {
   return column(truth, { array: "costate", width: players * players * count, place: player * players * count + shown.place });
 }
 
-/** 1, 2 and 5 times powers of ten on both sides of 0 within the ends, thinned out to some ten. */
+/** Round numbers within the ends, evenly. */
+function evenLevels(low, high) {
+  const rough = (high - low) / 8;
+  const power = 10 ** Math.floor(Math.log10(rough));
+  const step = power * [1, 2, 5, 10].find((digit) => digit * power >= rough);
+  const first = Math.ceil(low / step);
+  return Array.from({ length: Math.floor(high / step) - first + 1 }, (_, k) => (first + k) * step);
+}
+
+/** 1, 2 and 5 times powers of ten on both sides of 0 within the ends, thinned out to some ten; even ones where the ends
+ * have the same size. */
 function levels(low, high) {
+  if (low * high > 0 && Math.max(low / high, high / low) < 20) return evenLevels(low, high);
   const steps = [0];
   for (let power = -2; power < 8; power++) for (const digit of [1, 2, 5]) steps.push(digit * 10 ** power, -digit * 10 ** power);
   const inside = steps.filter((step) => step >= low && step <= high).sort((a, b) => a - b);
@@ -156,7 +167,7 @@ function surface(host, values, n, given, barrier, moved) {
   const data = { grid: raster(values.map((one) => one ?? NaN), n), shape: raster(known, n), barrier: raster(barrier, n), arrows: moved ? arrows(moved, n, width, height) : [] };
   const level = moved && land.evaluate ? $("land-level").value : "";
   if (level !== "") Object.assign(data, { family: family(COARSE, chosen()) });
-  const signals = { width, height, columns: n, rows: n, coarse_points: COARSE, x_title, y_title, x_ends: ends(land.across), y_ends: ends(land.up), level: level === "" ? [] : [Number(level)], ...given };
+  const signals = { width, height, columns: n, rows: n, coarse_points: COARSE, type_ends: land.content.theta.map(([end]) => end), x_title, y_title, x_ends: ends(land.across), y_ends: ends(land.up), level: level === "" ? [] : [Number(level)], ...given };
   return draw($(host), "landscape", data, signals, "canvas");
 }
 
