@@ -152,7 +152,7 @@ class Feedback(nn.Module, Policy):
             up: what runs upwards; neither of both for the game's own slice.
             theta: player types, (P,); the middle of the type box by default.
             tau: time to go, s; half the horizon by default.
-            at: values of other coordinates by name; those that are not named are in the middle of the start box.
+            at: values of other coordinates by name; those that are not named are as in `game.base_state()`.
             points: along each side.
 
         Raises:

@@ -86,18 +86,12 @@ def grid(game: Game, plane: Plane, points: int) -> Grid:
     placed = {name: game.coordinate(name) for name in plane.at}
     _check_apart([coordinate for coordinate, _ in axes], list(placed.values()))
     sides = [_side(coordinate, axis, points) for coordinate, axis in axes]
-    x = base_state(game)
+    x = game.base_state()
     for name, coordinate in placed.items():
         x = coordinate.put(x, float(plane.at[name]))
     up, across = torch.meshgrid(*(torch.from_numpy(side.values) for side in reversed(sides)), indexing="ij")
     x = axes[1][0].put(axes[0][0].put(x, across), up)
     return Grid((sides[0], sides[1]), x)
-
-
-def base_state(game: Game) -> Tensor:
-    """The middle of the start box, where coordinates stand that nobody names, (P, n), float64."""
-    box = game.initial_box
-    return ((box.lo + box.hi) / 2).detach().cpu().double()
 
 
 def _check_apart(axes: Sequence[Coordinate], placed: Sequence[Coordinate]) -> None:

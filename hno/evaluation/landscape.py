@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from hno.control import Feedback
 from hno.control.exported import ExportedPolicy
-from hno.control.slices import Side, Slice, base_state, chosen_plane, take
+from hno.control.slices import Side, Slice, chosen_plane, take
 from hno.export.page_program import page_program
 from hno.games import Game
 from hno.types import Extremal, Status
@@ -52,7 +52,7 @@ def landscape(policy: Feedback, truth: int = 0, equilibria: Equilibria | None = 
     return {
         "program": program, "reason": reason, "players": game.players, "states": game.state_dim,
         "horizon": game.horizon, "unit": game.constraint_unit, "potential": policy.operator.potential,
-        "coordinates": _coordinates(game), "start": base_state(game).flatten().tolist(), "theta": _box(game.type_box),
+        "coordinates": _coordinates(game), "start": game.base_state().flatten().tolist(), "theta": _box(game.type_box),
         "plane": {"across": _ends(own.across), "up": _ends(own.up), "at": dict(plane.at)},
         "python": _arrays(own),
         "truth": _truth(game, own, equilibria) if truth and equilibria else None,
@@ -78,7 +78,7 @@ def script(content: Mapping[str, Any]) -> str:
 
 def _coordinates(game: Game) -> list[dict[str, Any]]:
     return [
-        {**one._asdict(), "weights": one.weights.flatten().tolist(), "start": float(one.of(base_state(game)))}
+        {**one._asdict(), "weights": one.weights.flatten().tolist(), "start": float(one.of(game.base_state()))}
         for one in game.coordinates().values()
     ]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import MappingProxyType
 from typing import final
 
 import torch
@@ -27,7 +28,8 @@ class LaneChange(Cars):
     """
 
     roles = (0, 1)
-    plane = Plane(Axis("gap", -15, 15), Axis("offset", -6, 6))
+    plane = Plane(Axis("gap", -15, 15), Axis("offset", -4, 6))
+    base = MappingProxyType({"px_1": 40.0, "px_2": 40.0})
     positive = ("speed",)
     lanes: Tensor
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import difflib
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
@@ -24,7 +25,7 @@ class Axis(NamedTuple):
 
 
 class Plane(NamedTuple):
-    """Two coordinates, and values of others; what is not named stands in the middle of the start box."""
+    """Two coordinates, and values of others; what is not named is as in the base state."""
 
     across: Axis
     up: Axis
@@ -63,6 +64,9 @@ class Coordinates:
     """Of a player's states."""
     relative_names: ClassVar[Sequence[str]] = ()
     """Coordinates that are the components of player 2's position minus player 1's, m; `positions` is affine then."""
+    base: ClassVar[Mapping[str, float]] = MappingProxyType({})
+    """Coordinates of the state that slices go through, from which axes move; others are in the middle of the start
+    box."""
     plane: ClassVar[Plane | None] = None
     """What pictures show first; by default the first state of players 1 and 2, or the first two states of one."""
 
@@ -83,6 +87,14 @@ class Coordinates:
         states = list(enumerate(zip(names, units, strict=True)))
         found = [_state(game, player, one) for player in range(game.players) for one in states]
         return {one.name: one for one in [*found, *_relative(game, self.relative_names)]}
+
+    def base_state(self) -> Tensor:
+        """The state that slices go through, (P, n), float64. Raises as `coordinate`."""
+        game = cast("Game", self)
+        x = ((game.initial_box.lo + game.initial_box.hi) / 2).detach().cpu().double()
+        for name, value in self.base.items():
+            x = self.coordinate(name).put(x, value)
+        return x
 
     def default_plane(self) -> Plane:
         """`plane`, or the first state of players 1 and 2, or the first two states of one player.
@@ -125,22 +137,23 @@ def _relative(game: Game, names: Sequence[str]) -> list[Coordinate]:
     """Components of the way from player 1 to player 2, which must be affine functions of the state."""
     if not names:
         return []
-    lo, hi = game.state_box.lo.detach().cpu().double(), game.state_box.hi.detach().cpu().double()
+    box = copy.deepcopy(game.state_box).cpu().double()
 
     def apart(x: Tensor) -> Tensor:
-        one, other = game.positions(x.to(game.state_box.lo).unsqueeze(0))[0, :2]
-        return (other - one).double()
+        one, other = game.positions(x.to(game.state_box.lo)).double().cpu()[:, :2].unbind(1)
+        return other - one
 
-    origin = apart(torch.zeros_like(lo))
-    units = torch.eye(lo.numel(), dtype=torch.float64).view(-1, *lo.shape)
-    weights = torch.stack([apart(unit) - origin for unit in units], -1).view(-1, *lo.shape)
-    ends = weights * lo, weights * hi
-    for end, part in zip((lo, hi), ends, strict=True):
-        if len(names) != len(origin) or not torch.allclose(part.sum((-1, -2)) + origin, apart(end), atol=1e-3):
-            raise ValueError(
-                f"relative_names of {type(game).__name__} are {list(names)}: they need one name for each of the "
-                f"{len(origin)} components of positions, which must be affine functions of the state."
-            )
+    units = torch.eye(box.lo.numel(), dtype=torch.float64).view(-1, *box.lo.shape)
+    origin = apart(torch.zeros_like(box.lo).unsqueeze(0))[0]
+    weights = (apart(units) - origin).mT.reshape(-1, *box.lo.shape)
+    some = box.sample(8, torch.Generator().manual_seed(0))
+    affine = torch.einsum("dpn,bpn->bd", weights, some) + origin
+    if len(names) != len(origin) or not torch.allclose(affine, apart(some), atol=1e-3):
+        raise ValueError(
+            f"relative_names of {type(game).__name__} are {list(names)}: they need one name for each of the "
+            f"{len(origin)} components of positions, which must be affine functions of the state."
+        )
+    ends = weights * box.lo, weights * box.hi
     low, high = (extreme(*ends).sum((-1, -2)) + origin for extreme in (torch.minimum, torch.maximum))
     rows = zip(names, weights, origin, low, high, strict=True)
     return [Coordinate(name, "m", weight, *map(float, rest)) for name, weight, *rest in rows]
