@@ -31,6 +31,7 @@ from hno.report.tables import (
     section_tables,
     type_table,
 )
+from hno.report.validity import validity
 
 EPISODES = 400
 """Episodes of a page, at most."""
@@ -65,6 +66,7 @@ def render(sweep: Sweep, refresh: float | None = None, place: Path | None = None
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
     environment.globals |= {"format": text, "verdicts": verdicts, "names_of": names_of, "type_table": type_table}
+    environment.globals["validity"] = validity
     return environment.get_template("page.html.j2").render(
         sweep=sweep, recipes=found, games={game: (headline(own), own) for game, own in games.items()}, cards=cards,
         unfinished=[run for run in runs if not run.finished], filters={name: _choices(runs, name) for name in FILTERS},

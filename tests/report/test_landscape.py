@@ -147,12 +147,12 @@ def test_the_page_shows_values_equilibria_and_errors_from_a_file_beside_it(conte
     page.close()
 
 
-def test_the_landscape_fits_a_phone(context, content, tmp_path, width=390):  # noqa: F811
+def test_the_landscape_fits_a_phone(context, content, tmp_path):  # noqa: F811
     run_with(tmp_path, content)
     browser = opened(context, tmp_path)
-    browser.page.set_viewport_size({"width": width, "height": 900})
+    browser.page.set_viewport_size({"width": 390, "height": 900})
     browser.page.locator("#land-learned canvas").wait_for()
-    assert browser.page.evaluate("document.documentElement.scrollWidth") == width
+    assert browser.page.evaluate("document.documentElement.scrollWidth") == 390
     browser.page.close()
 
 
