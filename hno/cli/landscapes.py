@@ -7,6 +7,7 @@ import time
 
 from hno.cli.results import Results
 from hno.data.store import replace_whole
+from hno.evaluation.film import frames
 from hno.evaluation.landscape import landscape, script
 from hno.evaluation.sections import Evaluation
 
@@ -29,6 +30,7 @@ def write_landscape(evaluation: Evaluation, results: Results, number: int = 0) -
         return {}
     try:
         content = landscape(evaluation.policy, options["landscape_truth"], evaluation.equilibria)
+        content["film"] = frames(results.path.parent)
         text = script(content)
     except ValueError as error:
         log.warning("There is no landscape: %s", error)

@@ -14,6 +14,7 @@ from hno.cli.arguments import Arguments
 from hno.cli.build import build, check, how_to_train, record_of
 from hno.cli.config import configured
 from hno.cli.evaluate import describe, play_starts, unseen_types
+from hno.cli.film import Film
 from hno.cli.landscapes import write_landscape
 from hno.cli.logs import StepBar, StepLines, label_progress, loggers, use_threads
 from hno.cli.media import publish
@@ -93,10 +94,11 @@ def train_operator(settings: TrainSettings, folder: Path, results: Results) -> F
     results.update(label_statistics=summaries(data.extremals))
     first, later = validation_starts(settings, data, results)
     bar = StepBar() if sys.stdout.isatty() else StepLines(settings.trainer.print_every)
+    watching: list[L.Callback] = [bar, *([Film(folder)] if settings.evaluation.landscape else [])]
     try:
         fitted = fit(
             operator, objective, data, how_to_train(settings), folder, validation=first, later=later,
-            record=record_of(settings, built), loggers=makers, callbacks=[bar], resume=resume,
+            record=record_of(settings, built), loggers=makers, callbacks=watching, resume=resume,
         )  # fmt: skip
     except DivergedError:
         if (folder / BEST).exists():

@@ -213,6 +213,30 @@ function drawLandscape(coarse = false) {
   land.drawn = { n, values, shown };
 }
 
+/** One frame of the training, on the game's own slice. */
+function drawFilm(k) {
+  const { film, truth, plane, potential } = land.content;
+  Object.assign(land, { across: plane.across.name, up: plane.up.name });
+  if ($("land-across").value !== land.across || $("land-up").value !== land.up) resetLandscape();
+  const width = potential ? 1 : land.content.players;
+  const place = chosen().array === "value" && !potential ? chosen().place : 0;
+  const all_frames = film.frames.map(({ values }) => values.filter((_, at) => at % width === place));
+  const wanted = truth ? column(truth, { array: potential ? "potential" : "value", width, place }) : [];
+  const title = potential ? "W" : `V${place + 1}`;
+  for (const name of ["truth", "error"]) $(`land-${name}-box`).hidden = true;
+  surface("land-learned", all_frames[k], film.points, { ...scaleOf([...all_frames.flat(), ...wanted], false), title, level: [] }, film.violation);
+  $("land-film-step").textContent = `step ${film.frames[k].step}`;
+  $("land-said").textContent = `${title} after step ${film.frames[k].step}, frame ${k + 1} of ${film.frames.length}, from Python.`;
+}
+
+function showFilm() {
+  const frames = land.content.film?.frames ?? [];
+  $("land-film-box").hidden = frames.length < 2;
+  $("land-film").max = frames.length - 1;
+  $("land-film").value = frames.length - 1;
+  $("land-film-step").textContent = frames.length ? `step ${frames.at(-1).step}` : "";
+}
+
 const median = (values) => values.toSorted((a, b) => a - b)[Math.floor(values.length / 2)];
 
 function said(compared, values, wanted) {
@@ -288,6 +312,7 @@ function received(content) {
   if (before && before < options.length) $("land-shown").value = before;
   Object.assign(land, { across: content.plane.across.name, up: content.plane.up.name, tau: content.python.tau, theta: content.python.theta });
   land.at = Object.fromEntries(content.coordinates.map(({ name }) => [name, startOf(name)]));
+  showFilm();
   land.error = land.evaluate && difference();
   if (!(land.error <= TOLERANCE)) land.evaluate = null;
   resetLandscape();
@@ -319,6 +344,7 @@ if ($("landscape")) {
   $("land-run").addEventListener("change", loadLandscape);
   for (const name of ["shown", "level"]) $(`land-${name}`).addEventListener("change", () => drawLandscape());
   $("land-arrows").addEventListener("change", () => drawLandscape());
+  $("land-film").addEventListener("input", () => drawFilm(Number($("land-film").value)));
   $("land-reset").addEventListener("click", resetLandscape);
   for (const side of ["across", "up"]) {
     $(`land-${side}`).addEventListener("change", () => {
