@@ -9,6 +9,7 @@ import altair as alt
 import numpy as np
 
 from hno.control.slices import Slice
+from hno.evaluation.format import at
 from hno.report import vega
 
 
@@ -33,17 +34,17 @@ def chart(found: Slice) -> alt.Chart:
         for j, x in enumerate(found.across.values)
         if np.isfinite(value[k, j])
     ]  # fmt: skip
-    axes = {axis: {"title": side.label, "scale": alt.Scale(zero=False, nice=False)} for axis, side in sides.items()}
+    tight = alt.Scale(zero=False, nice=False)
     return (
         alt.Chart(vega.inline(rows))
         .mark_rect()
         .encode(
-            x=alt.X("x:Q", **axes["x"]),
+            x=alt.X("x:Q", title=found.across.label, scale=tight),
             x2="x2",
-            y=alt.Y("y:Q", **axes["y"]),
+            y=alt.Y("y:Q", title=found.up.label, scale=tight),
             y2="y2",
             color=alt.Color("value:Q", title=name, scale=alt.Scale(type="symlog", scheme="viridis")),
             stroke=alt.condition("datum.inside", alt.value("#c22f2f"), alt.value(None)),
         )
-        .properties(width=320, height=240, title=f"{name}, {found.tau:g} s to go, types {found.theta}")
+        .properties(width=320, height=240, title=f"{name}, {found.tau:g} s to go, types {at(found.theta)}")
     )

@@ -147,6 +147,25 @@ def test_the_page_shows_values_equilibria_and_errors_from_a_file_beside_it(conte
     page.close()
 
 
+def test_the_film_shows_the_slice_after_every_validation(context, content, tmp_path):  # noqa: F811
+    size = 17 * 17
+    shots = [{"step": step, "values": [float(-step - k) for k in range(size)]} for step in (10, 20, 30)]
+    film = {"points": 17, "violation": [float(k - 100) for k in range(size)], "frames": shots}
+    run_with(tmp_path, {**content, "film": film})
+    browser = opened(context, tmp_path)
+    page = browser.page
+    page.locator("#land-learned canvas").wait_for()
+    assert page.inner_text("#land-film-step") == "step 30"
+    page.select_option("#land-up", "v_2")
+    page.locator("#land-film").fill("1")
+    browser.until("document.querySelector('#land-said').textContent.includes('W after step 20, frame 2 of 3')")
+    assert page.input_value("#land-up") == "offset"
+    page.click("#land-reset")
+    browser.until("document.querySelector('#land-said').textContent.includes('Evaluated in this page')")
+    assert browser.said == []
+    page.close()
+
+
 def test_the_landscape_fits_a_phone(context, content, tmp_path):  # noqa: F811
     run_with(tmp_path, content)
     browser = opened(context, tmp_path)
