@@ -45,6 +45,8 @@ def chart() -> dict[str, Any]:
             {"name": "width", "value": 300}, {"name": "height", "value": 260},
             *({"name": name, "value": value} for name, value in SIGNALS.items()),
             {"name": "pixel", "update": PIXEL.format("columns", "rows")},
+            {"name": "pointer", "on": [
+                {"events": "pointermove", "update": "[invert('x', x()), invert('y', y())]"}]},
             {"name": "coarse", "update": PIXEL.format("coarse_points", "coarse_points")},
         ],
         "data": [

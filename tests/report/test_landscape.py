@@ -129,6 +129,8 @@ def test_the_page_shows_values_equilibria_and_errors_from_a_file_beside_it(conte
     assert "Evaluated in this page" in said
     assert "24 of 25 points have an equilibrium" in said
     assert page.locator("#land-shown option").all_inner_texts()[:3] == ["W", "V1", "V2"]
+    page.locator("#land-truth canvas").hover(position={"x": 120, "y": 80})
+    browser.until("/^gap .* m, offset .* m: W -?[0-9.]+$/.test(document.querySelector('#land-at').textContent)")
     for label in ("V2", "∂W/∂v_1"):
         page.select_option("#land-shown", label=label)
     page.select_option("#land-across", "v_1")

@@ -168,7 +168,22 @@ function surface(host, values, n, given, barrier, moved) {
   const level = moved && land.evaluate ? $("land-level").value : "";
   if (level !== "") Object.assign(data, { family: family(COARSE, chosen()) });
   const signals = { width, height, columns: n, rows: n, coarse_points: COARSE, type_ends: land.content.theta.map(([end]) => end), x_title, y_title, x_ends: ends(land.across), y_ends: ends(land.up), level: level === "" ? [] : [Number(level)], ...given };
-  return draw($(host), "landscape", data, signals, "canvas");
+  draw($(host), "landscape", data, signals, "canvas").then((view) =>
+    view?.addSignalListener("pointer", (_name, at) => showValue(at, values, n, given.title)),
+  );
+}
+
+/** The value of the point of the grid that is nearest to the pointer. */
+function showValue(at, values, n, title) {
+  const sides = ["across", "up"].map((side, k) => {
+    const [lo, hi] = ends(land[side]);
+    const place = Math.round(((at[k] - lo) / (hi - lo)) * (n - 1));
+    return { ...coordinate(land[side]), place, value: lo + ((hi - lo) * place) / (n - 1) };
+  });
+  if (!sides.every(({ place }) => place >= 0 && place < n)) return;
+  const found = values[sides[1].place * n + sides[0].place];
+  const where = sides.map(({ name, unit, value }) => `${name} ${Number(value.toPrecision(3))} ${unit}`).join(", ");
+  $("land-at").textContent = `${where}: ${title} ${Number.isFinite(found) ? Number(found.toPrecision(4)) : "n/a"}`;
 }
 
 /** Ends of a colour scale and its levels. */
