@@ -75,7 +75,7 @@ def chart() -> dict[str, Any]:
             {"scale": "x", "orient": "bottom", "title": {"signal": "x_title"}, "tickCount": 6},
             {"scale": "y", "orient": "left", "title": {"signal": "y_title"}, "tickCount": 6},
         ],
-        "legends": [{"fill": "color", "type": "gradient", "title": {"signal": "title"}, "format": ",.4~g",
+        "legends": [{"fill": "color", "type": "gradient", "title": {"signal": "title"}, "format": ",.5~g",
                      "gradientLength": {"signal": "height - 30"}, "values": {"signal": "levels"}}],
         "marks": [{
             "type": "group", "clip": True,

@@ -264,7 +264,7 @@ function said(compared, values, wanted) {
     const off = values.map((one, k) => Math.abs(one - wanted[k])).filter((_, k) => wanted[k] !== null);
     parts.push(`${truth.solved} of ${python.points ** 2} points have an equilibrium; median error ${median(off).toPrecision(2)}, largest ${Math.max(...off).toPrecision(2)}.`);
   } else if (truth) parts.push("Equilibria are known on the game's own slice.");
-  else parts.push("evaluation.landscape_truth=15 would solve equilibria to compare with.");
+  else parts.push("A training with evaluation.landscape_truth=15 solves equilibria to compare with.");
   return parts.join(" ");
 }
 
