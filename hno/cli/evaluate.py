@@ -221,3 +221,5 @@ def check_evaluation(game: Game, settings: Episodes) -> None:
     """Raise ValueError for entries that make no evaluation of the game."""
     table_condition(game, settings.model_dump())
     control_steps(game, settings.dt)
+    if settings.landscape_truth == 1:
+        raise ValueError("landscape_truth is the points along each side of a plane: 0 for none, or at least 2; got 1.")

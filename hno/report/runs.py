@@ -93,7 +93,7 @@ def _runs(folder: Path, name: str) -> list[Run]:
     models = content.pop("models", None) or [{}]
     if not (isinstance(models, list) and all(isinstance(model, dict) for model in models)):
         raise ValueError(f"{RESULTS} is not hno's: models is no list of objects")
-    shared = {key: value for key, value in content.items() if key not in ("episodes", "comparison")}
+    shared = {key: value for key, value in content.items() if key not in ("episodes", "comparison", "landscape")}
     names = [name] if len(models) == 1 else [f"{name} [{k}]" for k in range(len(models))]
     return [
         _run(folder, name, {**(shared if k else content), **model})

@@ -62,6 +62,13 @@ def test_a_game_without_a_slice_loses_no_results(evaluation: Any, tmp_path: Path
     assert "There is no landscape: NarrowRoad has 4 states per player" in caplog.text
 
 
+def test_a_plane_of_one_point_is_refused_before_anything_is_solved(command: Command) -> None:
+    run = command("train", *SMOKE, "evaluation.landscape_truth=1")
+    assert run.code == 2
+    assert "0 for none, or at least 2; got 1" in run.text
+    assert not (run.folder / "results.json").exists()
+
+
 @pytest.mark.slow
 def test_a_training_writes_landscape_truth_film_and_errors_off_the_labels(command: Command) -> None:
     asked = "evaluation.landscape=true", "evaluation.landscape_truth=2", "evaluation.off_labels=1"

@@ -208,6 +208,19 @@ def test_a_file_that_has_gone_is_named(context, content, tmp_path):  # noqa: F81
     browser.page.close()
 
 
+def test_each_model_of_an_evaluation_has_its_own_landscape_or_none(tmp_path):
+    results = make_results(
+        "narrow_road", "sno", "tanh", 0, np.random.default_rng(0), GRID5[:1], landscape="landscape.js"
+    )
+    models = [{"landscape": "landscape.js"}, {}, {"landscape": "landscape2.js"}, {"landscape": "../../landscape.js"}]
+    place = write_run(tmp_path / "one", results | {"models": models})
+    for name in ("landscape.js", "landscape2.js"):
+        (place / name).write_text("")
+    found = [run.landscape and run.landscape.name for run in load(tmp_path).runs]
+    assert found == ["landscape.js", None, "landscape2.js", "landscape.js"]
+    assert all(run.landscape is None or run.landscape.parent == place for run in load(tmp_path).runs)
+
+
 def test_the_page_itself_holds_no_landscape_and_names_the_file_from_where_it_lies(content, tmp_path):
     for name in ("a b", "c"):
         run_with(tmp_path / "runs", content, name)
