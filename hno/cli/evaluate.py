@@ -11,10 +11,12 @@ from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig
+from torch import Tensor
 
 from hno.cli import launch
 from hno.cli.arguments import Arguments
 from hno.cli.config import read
+from hno.cli.landscapes import write_landscape
 from hno.cli.logs import use_threads
 from hno.cli.media import draw_typical
 from hno.cli.progress import label_progress, progress
@@ -24,9 +26,10 @@ from hno.cli.settings import Episodes, EvaluateSettings
 from hno.control.exported import ExportedPolicy, is_exported, load_exported
 from hno.control.rollout import control_steps
 from hno.data.labels import Request, default_cache, labels_for, safe_labels_for
+from hno.data.states import equilibria_from
 from hno.evaluation.closed_loop import CollisionTable, play
 from hno.evaluation.comparison import PairedComparison, check_same_game
-from hno.evaluation.conditions import TIES, table_condition
+from hno.evaluation.conditions import TIES, Condition, table_condition
 from hno.evaluation.episodes import EPISODES, PATHS, Kept, episodes, together, write_paths
 from hno.evaluation.format import title
 from hno.evaluation.outcome import Played, numbers_of
@@ -110,7 +113,7 @@ def describe(
     Labels of the starts depend on the game, the types and the options `starts`, `seed`, `safe` and `clearance` alone:
     every model meets the same ones. Equal starts have the same labels, the same object.
     """
-    game, types = models[0][1].game, list(dict.fromkeys(types))
+    game, types, place = models[0][1].game, list(dict.fromkeys(types)), Path(cache or default_cache())
     solver = functools.partial(safe_labels_for, clearance=options["clearance"]) if options["safe"] else labels_for
 
     @functools.cache
@@ -119,11 +122,17 @@ def describe(
         kind = starts, options["seed"], "test", widen, symmetric, ties
         requests = [Request(theta, *kind) for theta in types]
         with label_progress("test labels") as report:
-            return solver(game, requests, Path(cache or default_cache()), workers=workers, report=report)[0]
+            return solver(game, requests, place, workers=workers, report=report)[0]
+
+    def equilibria(game: Game, x0: Tensor, theta: Tensor, tau: float) -> Extremal:
+        with label_progress("equilibria") as report:
+            return equilibria_from(game, x0, theta, tau, place, workers=workers, report=report)
+
+    def starts(condition: Condition) -> Sequence[Extremal]:
+        return solve(*condition.starts)
 
     return [
-        Evaluation(name, policy, policy.types, types, options, lambda condition: solve(*condition.starts))
-        for name, policy in models
+        Evaluation(name, policy, policy.types, types, options, starts, equilibria=equilibria) for name, policy in models
     ]
 
 
@@ -145,6 +154,8 @@ def evaluate(settings: EvaluateSettings, results: Results) -> None:
         for name, content in run_sections(found, results):
             model[name] = content
             results.update(**models[0])
+        model |= write_landscape(found, results, number)
+        results.update(**models[0])
     if len(models) > 1:
         results.update(models=models, comparison=PairedComparison().compute(played))
 
@@ -234,3 +245,5 @@ def check_evaluation(game: Game, settings: Episodes) -> None:
     """Raise ValueError for entries that make no evaluation of the game."""
     table_condition(game, settings.model_dump())
     control_steps(game, settings.dt)
+    if settings.landscape_truth == 1:
+        raise ValueError("landscape_truth is the points along each side of a plane: 0 for none, or at least 2; got 1.")

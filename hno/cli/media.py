@@ -75,7 +75,7 @@ def draw(results: Mapping[str, Any], folder: Path, kinds: Collection[type[Logger
         Names and files of the pictures.
     """
     made = {name: folder / f"{name}.png" for name in ("rollout", "worst_episode", "collision_map")}
-    with _harmless():
+    with harmless():
         from hno.report.pictures import collision_map
 
         if WandbLogger in kinds and (worst := worst_episode(results, folder)):
@@ -89,7 +89,7 @@ def draw(results: Mapping[str, Any], folder: Path, kinds: Collection[type[Logger
 
 def draw_typical(episodes: Sequence[Mapping[str, Any]], path: Path, title: str) -> None:
     """Draw the first typical episode of episodes.json, if there is one; say what cannot be drawn."""
-    with _harmless():
+    with harmless():
         typical = next((entry for entry in episodes if entry["kind"] == "typical"), None)
         if typical is None:
             raise ValueError("no start has a safe equilibrium")
@@ -104,7 +104,7 @@ def _draw_episode(content: Mapping[str, Any], path: Path, title: str) -> None:
 
 
 @contextmanager
-def _harmless() -> Iterator[None]:
+def harmless() -> Iterator[None]:
     """A picture that cannot be drawn costs a line in the log, not the run."""
     try:
         yield

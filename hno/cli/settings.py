@@ -137,6 +137,9 @@ class Episodes(Settings):
     delay: Count
     ntk: bool
     ntk_rows: Size
+    landscape: bool
+    landscape_truth: Count
+    off_labels: Count
 
 
 class EvaluationSettings(Episodes):

@@ -13,6 +13,8 @@ from hno.cli.arguments import Arguments
 from hno.cli.build import build, check, chosen_callbacks, how_to_train, record_of
 from hno.cli.config import configured
 from hno.cli.evaluate import describe, play_starts, unseen_types
+from hno.cli.film import Film
+from hno.cli.landscapes import write_landscape
 from hno.cli.logs import loggers, rates, use_threads
 from hno.cli.media import publish
 from hno.cli.progress import StepLines, label_progress, progress
@@ -75,6 +77,7 @@ def train(settings: TrainSettings, results: Results) -> None:
     played, _ = play_starts(evaluation, results)
     for name, content in run_sections(played, results):
         results.update(**{name: content})
+    results.update(**write_landscape(played, results))
     publish(fitted.trainer.loggers, results.content, folder, fitted.trainer.global_step)
 
 
@@ -94,10 +97,11 @@ def train_operator(settings: TrainSettings, folder: Path, results: Results) -> F
     try:
         with progress("training", None) as update:
             chosen = chosen_callbacks(settings)
-            callbacks = [*chosen, *rates(makers, chosen), StepLines(settings.trainer.print_every, update)]
+            watching = [StepLines(settings.trainer.print_every, update), *rates(makers, chosen)]
+            watching += [Film(folder)] if settings.evaluation.landscape else []
             fitted = fit(
                 operator, objective, data, how_to_train(settings), folder, validation=first, later=later,
-                record=record_of(settings, built), loggers=makers, callbacks=callbacks, resume=resume,
+                record=record_of(settings, built), loggers=makers, callbacks=[*chosen, *watching], resume=resume,
             )  # fmt: skip
     except DivergedError:
         if (folder / BEST).exists():

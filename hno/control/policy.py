@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import abc
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from torch import Tensor, nn
 
 from hno.control.questions import X, in_type_of, outside, question
+from hno.control.slices import POINTS, AxisLike, Slice, chosen_plane, take
 from hno.games import Game
 from hno.games.base import ExtrapolationWarning
 from hno.operators.base import ValueOperator
@@ -130,6 +131,35 @@ class Feedback(nn.Module, Policy):
     def costate(self, tau: Numbers, x: X, theta: Numbers) -> X:
         """dV_i / dx_j, (B, P, P, n), or dW / dx_j, (B, 1, P, n). Raises as `act`."""
         return self._asked(tau, x, theta, lambda at: self.operator.field(at).costate)
+
+    def slice(
+        self,
+        across: AxisLike | None = None,
+        up: AxisLike | None = None,
+        *,
+        theta: Numbers | None = None,
+        tau: float | None = None,
+        at: Mapping[str, float] | None = None,
+        points: int = POINTS,
+    ) -> Slice:
+        """Values, costates, controls and the constraint on a grid over two coordinates of the joint state.
+
+        Coordinates are those of `game.coordinates()`: state and player, such as "px_1" and "v_2", and relative ones
+        where the game has some, such as "gap" and "offset".
+
+        Args:
+            across: what runs to the right, a name or (name, from, to); by default to the edges of the PDE box.
+            up: what runs upwards; neither of both for the game's own slice.
+            theta: player types, (P,); the middle of the type box by default.
+            tau: time to go, s; half the horizon by default.
+            at: values of other coordinates by name; those that are not named are as in `game.base_state()`.
+            points: along each side.
+
+        Raises:
+            ValueError: a coordinate that does not exist or that another one moves, an empty range, too few points; or
+                as `act`.
+        """
+        return take(self, chosen_plane(self.game, across, up, at), theta, tau, points)
 
     def answer(self, tau: Tensor, x: Tensor, theta: Tensor) -> Answer:
         """Value, costates and controls of one state, (), (P, n), (P,): a pure function without checks.

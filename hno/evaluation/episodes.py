@@ -78,8 +78,9 @@ def together(game: Game, kept: Sequence[Kept]) -> dict[str, Any]:
     """JSON content of a file of episodes, with what is common to all of them."""
     dimensions, scene = game.positions(game.state_box.lo).shape[-1], game.scene()
     units = {"players": game.players, "dimensions": dimensions, "constraint_unit": game.constraint_unit}
-    sizes = {"states": game.state_dim, "controls": game.control_dim, "players": game.players}
+    sizes = {"controls": game.control_dim, "players": game.players}
     names = {kind: scene.named(kind, count) for kind, count in sizes.items()}
+    names["states"] = tuple(f"{name} [{unit}]" if unit else name for name, unit in game.named_states())
     drawn = {"bodies": scene.bodies, "roads": [road._asdict() for road in scene.roads], "note": scene.note, **names}
     return {**units, "scene": drawn, "episodes": [one.content for one in kept]}
 

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 from hno.control import Feedback
+from hno.data.states import equilibria_from
 from hno.evaluation import format as text
 from hno.evaluation.conditions import Condition, table_condition
 from hno.evaluation.outcome import Played
@@ -73,6 +74,8 @@ class Evaluation(NamedTuple):
     """Labels of the starts, one set per type; empty before they are solved."""
     played: Sequence[Played] = ()
     """What came of the episodes from these starts, one set per type."""
+    equilibria: Callable[..., Extremal] = equilibria_from
+    """As `hno.data.states.equilibria_from`, with the cache, the processes and the report of the command."""
 
     @property
     def game(self) -> Game:

@@ -8,9 +8,10 @@ from hno.games.affine import ControlAffineGame
 from hno.games.base import Game, games
 from hno.games.box import Box
 from hno.games.collision import CollisionAvoidance
+from hno.games.plane import Axis, Plane
 from hno.registry import UnknownNameError, unknown_name
 
-__all__ = ["Box", "CollisionAvoidance", "ControlAffineGame", "Game", "games", "make"]
+__all__ = ["Axis", "Box", "CollisionAvoidance", "ControlAffineGame", "Game", "Plane", "games", "make"]
 
 
 def make(name: str, **constants: float | Sequence[float]) -> Game:

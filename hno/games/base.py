@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from hno.games.box import Box
 from hno.games.final import FinalMethods
 from hno.games.fingerprint import fingerprint
+from hno.games.plane import Coordinates
 from hno.games.scene import Scene
 from hno.registry import Registry
 
@@ -27,7 +28,7 @@ class ExtrapolationWarning(UserWarning):
     """Player types or states outside the range that a game is made for."""
 
 
-class Game(FinalMethods, nn.Module, abc.ABC):
+class Game(FinalMethods, Coordinates, nn.Module, abc.ABC):
     """A P-player general-sum differential game with state constraints, in reward form (players maximise V = -J).
 
     The dynamics are decoupled: `dynamics(x, u)[..., i, :]` depends on the state and control of player i alone. What

@@ -13,6 +13,9 @@ from hno.games.kinematics import unicycle_drift
 class Cars(CollisionAvoidance):
     """Unicycles (px, py, psi, v) with controls (angular velocity, acceleration); a subclass sets the rest."""
 
+    state_names, state_units = ("px", "py", "psi", "v"), ("m", "m", "rad", "m/s")
+    relative_names = ("gap", "offset")
+
     def __init__(self) -> None:
         super().__init__()
         self.control_box = Box([-1, -5], [1, 10])

@@ -11,6 +11,7 @@ from hno.games.base import games
 from hno.games.box import Box
 from hno.games.collision import CollisionAvoidance
 from hno.games.kinematics import GRAVITY, double_integrator_drift
+from hno.games.plane import Axis, Plane
 from hno.games.scene import Scene
 
 
@@ -27,6 +28,9 @@ class Drone(CollisionAvoidance):
         horizon: length of the game, s.
     """
 
+    state_names, state_units = ("px", "py", "pz", "vx", "vy", "vz"), ("m",) * 3 + ("m/s",) * 3
+    relative_names = ("gap_x", "gap_y", "gap_z")
+    plane = Plane(Axis("gap_x", -5, 5), Axis("gap_y", -5, 5))
     positive = ("width",)
 
     def __init__(self, width: float = 5.0, radius: float = 0.5, horizon: float = 4.0) -> None:
@@ -60,9 +64,8 @@ class Drone(CollisionAvoidance):
 
     def scene(self) -> Scene:
         """Two drones, points in space."""
-        states = ("px [m]", "py [m]", "pz [m]", "vx [m/s]", "vy [m/s]", "vz [m/s]")
         players = ("drone 1, from the origin", "drone 2, from the opposite corner")
-        return Scene((), (), states, ("roll [rad]", "pitch [rad]", "thrust [m/s²]"), players)
+        return Scene((), (), ("roll [rad]", "pitch [rad]", "thrust [m/s²]"), players)
 
     def terminal_value(self, x: Tensor) -> Tensor:
         """Hover at height 0, (B, 2)."""

@@ -10,6 +10,7 @@ from torch import Tensor
 from hno.games.affine import ControlAffineGame
 from hno.games.base import games
 from hno.games.box import Box
+from hno.games.plane import Axis, Plane
 from hno.games.scene import CAR, CAR_CONTROLS, Road, Scene
 
 ROAD = 4.0
@@ -32,6 +33,8 @@ class Intersection(ControlAffineGame):
         horizon: length of the game, s.
     """
 
+    state_names, state_units = ("d", "v"), ("m", "m/s")
+    plane = Plane(Axis("d_1", 20, 50), Axis("d_2", 20, 50))
     positive = ("growth", "speed")
     distance_constraints = False
     potential = True
@@ -72,7 +75,7 @@ class Intersection(ControlAffineGame):
         roads = Road(0, (-ROAD / 2, ROAD / 2)), Road(1, (-ROAD / 2, ROAD / 2))
         note = "Bodies of 4.5 m by 1.8 m and roads 4 m wide are drawn for the eye; intervals of the roads decide."
         players = ("car 1, along x", "car 2, along y")
-        return Scene((CAR, CAR), roads, ("distance driven [m]", "speed [m/s]"), CAR_CONTROLS[1:], players, note)
+        return Scene((CAR, CAR), roads, CAR_CONTROLS[1:], players, note)
 
     def constraint(self, x: Tensor, theta: Tensor) -> Tensor:
         """How far both players are inside their intervals, m, (B, 2, 1)."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import MappingProxyType
 from typing import final
 
 import torch
@@ -11,7 +12,8 @@ from hno.games.base import games
 from hno.games.box import Box
 from hno.games.cars import Cars
 from hno.games.kinematics import DEGREE
-from hno.games.scene import CAR, CAR_CONTROLS, CAR_STATES, Road, Scene
+from hno.games.plane import Axis, Plane
+from hno.games.scene import CAR, CAR_CONTROLS, Road, Scene
 
 
 @final
@@ -27,6 +29,8 @@ class LaneChange(Cars):
     """
 
     roles = (0, 1)
+    plane = Plane(Axis("gap", -15, 15), Axis("offset", -4, 6))
+    base = MappingProxyType({"px_1": 40.0, "px_2": 40.0})
     positive = ("speed",)
     lanes: Tensor
 
@@ -57,7 +61,7 @@ class LaneChange(Cars):
         note = "Bodies of 4.5 m by 1.8 m and the edges of the lanes are drawn for the eye; the game knows neither."
         players = tuple(f"car {i + 1}, to the lane at {float(lane):g} m" for i, lane in enumerate(self.lanes))
         road = Road(0, (low - half, high + half), ((low + high) / 2,))
-        return Scene((CAR, CAR), (road,), CAR_STATES, CAR_CONTROLS, players, note)
+        return Scene((CAR, CAR), (road,), CAR_CONTROLS, players, note)
 
     def terminal_value(self, x: Tensor) -> Tensor:
         """Reach the other lane, straight and at nominal speed, (B, 2)."""

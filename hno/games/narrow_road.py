@@ -11,7 +11,8 @@ from hno.games.base import games
 from hno.games.box import Box
 from hno.games.cars import Cars
 from hno.games.kinematics import DEGREE
-from hno.games.scene import CAR, CAR_CONTROLS, CAR_STATES, Road, Scene
+from hno.games.plane import Axis, Plane
+from hno.games.scene import CAR, CAR_CONTROLS, Road, Scene
 
 
 @final
@@ -27,6 +28,7 @@ class NarrowRoad(Cars):
         horizon: length of the game, s.
     """
 
+    plane = Plane(Axis("gap", -10, 40), Axis("offset", -4, 4))
     positive = ("length", "speed")
 
     def __init__(
@@ -48,7 +50,7 @@ class NarrowRoad(Cars):
         edges = float(self.state_box.lo[0, 1]), float(self.state_box.hi[0, 1])
         note = "Bodies of 4.5 m by 1.8 m and a road as wide as the PDE box are drawn for the eye: the game has neither."
         players = ("car 1, from the left", "car 2, from the right")
-        return Scene((CAR, CAR), (Road(0, edges),), CAR_STATES, CAR_CONTROLS, players, note)
+        return Scene((CAR, CAR), (Road(0, edges),), CAR_CONTROLS, players, note)
 
     def terminal_value(self, x: Tensor) -> Tensor:
         """Stay in the lane at nominal speed, (B, 2)."""

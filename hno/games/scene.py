@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 CAR = (4.5, 1.8)
 """Length and width of a car as it is drawn, m."""
-CAR_STATES = ("px [m]", "py [m]", "heading [rad]", "speed [m/s]")
 CAR_CONTROLS = ("turn rate [rad/s]", "acceleration [m/s²]")
 
 
@@ -27,8 +26,6 @@ class Scene(NamedTuple):
     bodies: tuple[tuple[float, float], ...] = ()
     """Length and width of each player, m, seen from above and ahead along its path; empty for points."""
     roads: tuple[Road, ...] = ()
-    states: tuple[str, ...] = ()
-    """Name and unit of each state of a player."""
     controls: tuple[str, ...] = ()
     """Name and unit of each control."""
     players: tuple[str, ...] = ()
@@ -37,6 +34,6 @@ class Scene(NamedTuple):
     """What is drawn that the game does not know."""
 
     def named(self, kind: str, count: int) -> tuple[str, ...]:
-        """Names of "states", "controls" or "players"; numbered where the scene has others than `count` of them."""
+        """Names of "controls" or "players"; numbered where the scene has others than `count` of them."""
         own: tuple[str, ...] = getattr(self, kind)
         return own if len(own) == count else tuple(f"{kind.removesuffix('s')} {k + 1}" for k in range(count))

@@ -14,7 +14,7 @@ from markupsafe import Markup
 from hno.data.store import replace_whole
 from hno.evaluation import format as text
 from hno.evaluation.sections import plain
-from hno.report import page_data, vega, verdicts
+from hno.report import landscapes, page_data, vega, verdicts
 from hno.report.charts import specifications
 from hno.report.recipes import Recipe, best, headline, recipes
 from hno.report.records import Run
@@ -31,6 +31,7 @@ from hno.report.tables import (
     section_tables,
     type_table,
 )
+from hno.report.validity import validity
 
 EPISODES = 400
 """Episodes of a page, at most."""
@@ -38,12 +39,12 @@ EPISODES = 400
 
 def write_page(sweep: Sweep, path: Path, refresh: float | None = None) -> None:
     """Write the page, whole or not at all; `refresh` is in how many seconds an open page loads itself again."""
-    page = render(sweep, refresh)
+    page = render(sweep, refresh, path.parent)
     replace_whole(path, lambda draft: draft.write_text(page, encoding="utf-8"))
 
 
-def render(sweep: Sweep, refresh: float | None = None) -> str:
-    """The page as text."""
+def render(sweep: Sweep, refresh: float | None = None, place: Path | None = None) -> str:
+    """The page as text; `place` is the folder that it will lie in."""
     runs, found = sweep.runs, recipes(sweep.runs)
     cards, played, chosen = _cards(found), page_data.ranked(runs), best(found)
     curves = page_data.learning_curves(found, runs)
@@ -54,7 +55,8 @@ def render(sweep: Sweep, refresh: float | None = None) -> str:
         "episodes": [page_data.playable(run, one) for run, one in played[:EPISODES]],
         "scenes": page_data.scenes(runs),
         "members": {card["id"]: [run.name for run in card["recipe"].runs] for card in cards},
-        "charts": specifications(),
+        "landscapes": landscapes.entries(runs, place),
+        "charts": {**specifications(), "landscape": landscapes.chart()},
         "themes": {name: {"config": vega.chart_config(name), "signals": vega.signals(name)} for name in vega.THEMES},
         "refresh": refresh,
     }
@@ -66,6 +68,7 @@ def render(sweep: Sweep, refresh: float | None = None) -> str:
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
     environment.globals |= {"format": text, "verdicts": verdicts, "names_of": names_of, "type_table": type_table}
+    environment.globals["validity"] = validity
     return environment.get_template("page.html.j2").render(
         sweep=sweep, recipes=found, single=len(runs) == 1,
         games={game: (headline(own), own) for game, own in games.items()}, cards=cards,
@@ -73,7 +76,7 @@ def render(sweep: Sweep, refresh: float | None = None) -> str:
         curve_games=sorted({entry["game"] for entry in curves}), recipe_table=recipe_table(found),
         run_table=run_table(runs), labels=label_tables(runs), sections=[entry for entry in sections if entry[1]],
         common=common, differing=differing, cached=CACHED, shown=min(len(played), EPISODES), total=len(played),
-        refresh=refresh, themes=vega.THEMES, font=Markup(vega.FONT),
+        landscapes=data["landscapes"], refresh=refresh, themes=vega.THEMES, font=Markup(vega.FONT),
         vega=Markup(vega.library().replace("</script", "<\\/script").replace("<!--", "<\\!--")), data=embedded(data),
     )  # fmt: skip
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, SkipValidation, TypeAdapter, ValidationError
@@ -58,6 +59,8 @@ class Run(BaseModel):
 
     name: str = ""
     """Its folder, relative to the one that was asked for."""
+    landscape: SkipValidation[Path | None] = None
+    """The file of its landscape."""
     settings: SkipValidation[dict[str, str]] = {}
     """The configuration, dotted names."""
     curves: SkipValidation[Curves] = {}

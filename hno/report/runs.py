@@ -20,6 +20,8 @@ from hno.report.records import Curves, Run, sentence, type_row
 
 T = TypeVar("T")
 RESULTS, METRICS = "results.json", "csv/metrics.csv"
+OWN = "episodes", "outcomes", "comparison", "landscape"
+"""Entries of results.json that belong to the first of its models alone."""
 LOST = {"status": "lost", "reason": "its process ended without a word: it was killed, or its machine failed"}
 """What results become that still say "running" although no process is at work in their folder."""
 
@@ -94,7 +96,7 @@ def _runs(folder: Path, name: str) -> list[Run]:
     models = content.pop("models", None) or [{}]
     if not (isinstance(models, list) and all(isinstance(model, dict) for model in models)):
         raise ValueError(f"{RESULTS} is not hno's: models is no list of objects")
-    shared = {key: value for key, value in content.items() if key not in ("episodes", "outcomes", "comparison")}
+    shared = {key: value for key, value in content.items() if key not in OWN}
     names = [name] if len(models) == 1 else [f"{name} [{k}]" for k in range(len(models))]
     return [
         _run(folder, name, {**(shared if k else content), **model})
@@ -127,7 +129,7 @@ def read_json(path: Path) -> dict[str, Any]:
 def _run(folder: Path, name: str, content: Mapping[str, Any]) -> Run:
     """A model with what lies beside its results; what cannot be read there is left out and noted."""
     try:
-        run = Run.model_validate({**content, "episodes": [], "outcomes": {}})
+        run = Run.model_validate({**content, "episodes": [], "outcomes": {}, "landscape": None})
     except ValueError as error:
         raise ValueError(f"{RESULTS} is not hno's: {sentence(error)}") from error
     notes, metrics = list[str](), folder / METRICS
@@ -136,6 +138,8 @@ def _run(folder: Path, name: str, content: Mapping[str, Any]) -> Run:
         found["settings"]["checkpoint"] = str(run.checkpoint)
     found["command"] = _command(folder / ".hydra" / "hydra.yaml")
     found["overrides"] = tuple(shlex.split(found["command"] or "")[2:])
+    if isinstance(beside := content.get("landscape"), str) and (folder / Path(beside).name).is_file():
+        found["landscape"] = folder / Path(beside).name
     found["table"] = _each(run.table, type_row, "row of the table", notes)
     with _noted(notes, "no learning curves"):
         found["curves"] = _curves(metrics) if metrics.exists() else {}
