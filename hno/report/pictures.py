@@ -20,12 +20,13 @@ from hno.evaluation.outcome import pooled
 from hno.evaluation.sections import plain
 from hno.evaluation.spectrum import Ratio, condition_ratios
 from hno.report import charts, vega
-from hno.report.charts import encounter, separation
+from hno.report.charts import encounter
 from hno.report.episode import Episode, closest, distances, frames, whole
 from hno.report.page_data import comparison, ranked
 from hno.report.recipes import Recipe, best, by_type, headline, recipes
 from hno.report.records import Run, type_row
 from hno.report.runs import Sweep
+from hno.report.strips import separation
 from hno.report.tables import CACHED, Table, mapping_table, recipe_table
 from hno.report.verdicts import clearance, jobs, share, verdict, why
 

@@ -16,7 +16,6 @@ from hno.control.rollout import Trajectory
 from hno.evaluation.closed_loop import play
 from hno.evaluation.episodes import EPISODES, PATHS, episodes, together, write_paths
 from hno.games import Game, make
-from hno.games.scene import CAR_STATES
 from tests.fakes import evaluation_of, fake_labels
 
 
