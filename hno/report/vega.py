@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import altair as alt
@@ -70,9 +70,17 @@ def colors() -> list[alt.Parameter]:
 
 
 def compiled(chart: alt.TopLevelMixin) -> dict[str, Any]:
-    """A chart as Vega, without a configuration of its own."""
+    """A chart as Vega, without a configuration of its own and without names for its marks, which nobody could read."""
     vega = vl_convert.vegalite_to_vega({**chart.to_dict(), "config": {}}, vl_version=VERSION)
+    for mark in _marks(vega):
+        mark["aria"] = False
     return {name: entry for name, entry in vega.items() if name not in ("config", "background", "$schema")}
+
+
+def _marks(entry: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    for mark in entry.get("marks", ()):
+        yield mark
+        yield from _marks(mark)
 
 
 def svg(chart: alt.TopLevelMixin) -> str:
