@@ -57,7 +57,7 @@ def loggers(settings: TrainSettings, folder: Path, first: int = 0) -> list[Logge
             made.append(_wandb(settings, folder, mode))
         else:
             log.info("W&B is switched off: metrics go to %s alone.", METRICS)
-    return made or [CurveLogger(folder / METRICS, first)]
+    return made or [CurveLogger(folder / METRICS, first)] * bool(settings.logger.names)
 
 
 def _wandb(settings: TrainSettings, folder: Path, mode: str) -> Logger:

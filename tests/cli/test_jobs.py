@@ -112,6 +112,7 @@ def test_an_interrupted_multirun_shows_what_there_is(
         return outcome
 
     monkeypatch.setattr(launch, "perform", perform)
+    monkeypatch.setattr(launch, "objective", lambda *job: None)
     printed: list[int] = []
     monkeypatch.setattr("hno.cli.launch.show_jobs", lambda jobs: printed.extend(job.number for job in jobs))
     run = command("train", "-m", f"hydra.sweep.dir={tmp_path}/sweep", *SMOKE, "seed=0,1,2")
@@ -137,6 +138,7 @@ def test_a_job_that_is_refused_leaves_its_reason_and_no_page(
     command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(launch, "perform", lambda *job: True)
+    monkeypatch.setattr(launch, "objective", lambda *job: None)
     sweep = f"hydra.sweep.dir={tmp_path}/sweep"
     run = command("train", "-m", sweep, *SMOKE, "operator=hno,sno", "loss.weights.residual=0.1")
     assert run.code == 1

@@ -71,14 +71,14 @@ def test_help_shows_groups_that_can_be_chosen_and_keys_with_their_comments(
     printed = capsys.readouterr().out
     groups = printed[printed.index("Groups") : printed.index("Keys")]
     for part in (
-        "*drone ",
+        "* drone ",
         " narrow_road ",
-        "*sno ",
+        "* sno ",
         " hno ",
-        "*soap ",
-        "*auto ",
+        "* soap ",
+        "* auto ",
         " potential ",
-        "*deeponet ",
+        "* deeponet ",
         " fast ",
     ):
         assert part in groups

@@ -30,7 +30,7 @@ def test_the_new_game_passes_its_test_and_trains_once_it_is_installed(tmp_path: 
     ]
     code = f"from hno.cli.main import main; assert not any([main(words) for words in {commands}])"
     printed = python("-c", code, path=(site,), folder=tmp_path)
-    own = "Robots with states", "[hno-corridor-pass 0.1.0]", "*corridor_pass", "two robots that pass each other"
+    own = "Robots with states", "[hno-corridor-pass 0.1.0]", "* corridor_pass", "two robots that pass each other"
     for part in own:
         assert part in printed
     assert (tmp_path / "run" / "last.ckpt").exists()

@@ -17,6 +17,7 @@ from hno.cli.arguments import Arguments
 from hno.cli.build import check
 from hno.cli.config import compose, for_hydra
 from hno.cli.media import numbers
+from hno.cli.results import Results
 from hno.cli.settings import TrainSettings
 from hno.games import games
 from tests.cli.conftest import SMOKE, Command
@@ -98,14 +99,14 @@ def grid(command: Command, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> I
     def jobs(*overrides: str) -> Grid:
         made: Grid = []
 
-        def take(task: launch.Task, chosen: TrainSettings, folder: Path) -> bool:
+        def take(task: launch.Task, chosen: TrainSettings, folder: Path) -> Results:
             assert (chosen.function["name"], chosen.function["members"]) == ("value", 1), "the paper's are values"
             tests, names = chosen.evaluation, (chosen.operator.name, chosen.activation["name"])
             made.append((
                 chosen.game.name, *names, chosen.seed, chosen.optimizer["lr"], tests.starts, tests.safe,
                 len(tests.types), chosen.trainer.max_steps,
             ))  # fmt: skip
-            return True
+            return Results(folder / "results.json", {})
 
         monkeypatch.setattr(launch, "perform", take)
         monkeypatch.setattr(launch, "show_jobs", lambda jobs: None)

@@ -244,7 +244,7 @@ def test_one_failed_job_of_a_multirun_fails_the_command_but_not_the_others(comma
     sweep = f"hydra.sweep.dir={tmp_path}/sweep"
     run = command("train", "-m", sweep, *SMOKE, "trainer.max_steps=2", "optimizer.lr=1e30,0.001,0.002")
     assert run.code == 1
-    jobs = [Outcome(0, "", folder) for folder in sorted((tmp_path / "sweep").glob("*_narrow_road_hno_auto_sin"))]
+    jobs = [Outcome(0, "", folder) for folder in sorted((tmp_path / "sweep").glob("*_narrow_road_hno_auto_sin*"))]
     assert [job.results["status"] for job in jobs] == ["failed", "finished", "finished"]
 
 
