@@ -175,7 +175,7 @@ def test_progress_counts_the_rows_that_are_solved(tmp_path: Path, asked: Asked) 
     game, told = make("narrow_road"), list[Progress]()
     for starts in (100, 300, 300):
         labels_for(game, [REQUEST._replace(starts=starts)], tmp_path, workers=1, report=told.append)
-    assert told == [(100, 100, 100), (28, 200, 28), (156, 200, 156), (200, 200, 200)]
+    assert told == [(0, 100, 0), (100, 100, 100), (0, 200, 0), (28, 200, 28), (156, 200, 156), (200, 200, 200)]
 
 
 def test_progress_tells_converged_rows_from_failed_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -185,7 +185,7 @@ def test_progress_tells_converged_rows_from_failed_ones(tmp_path: Path, monkeypa
     monkeypatch.setattr(label_data, "solve", every_other)
     told: list[Progress] = []
     (found,), _ = labels_for(make("narrow_road"), [REQUEST], tmp_path, workers=1, report=told.append)
-    assert told == [(6, 6, 3)]
+    assert told == [(0, 6, 0), (6, 6, 3)]
     assert found.status.tolist() == [0, 1, 0, 1, 0, 1]
 
 
