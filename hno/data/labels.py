@@ -209,7 +209,7 @@ def safe_labels_for(
         requests: what is needed; `starts` counts safe ones.
         cache: folder of label sets.
         workers: see `labels_for`.
-        report: called as labels are written.
+        report: called before the first and as labels are written, of every enlargement of the sets anew.
         most: start states of a type after which the search for safe ones ends.
         clearance: what the equilibrium of a safe start keeps, m for distance constraints.
 
