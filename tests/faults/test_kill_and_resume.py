@@ -140,7 +140,7 @@ def test_another_training_is_refused_with_keys_and_values(command: Command, copy
         (["data.trajectories=5"], "data.trajectories: 4, now 5"),
         (["network.width=8"], "network.width: "),
         (["optimizer=adam"], "optimizer.name: 'soap', now 'adam'"),
-        (["validation.dt=0.2"], "validation.dt: 0.1, now 0.2"),
+        (["validation.dt=0.2"], "validation.dt: 0.25, now 0.2"),
         (["trainer.schedule_steps=300"], f"trainer.schedule_steps: {STEPS}, now 300"),
         (["trainer.max_steps=40"], f"is at step {STEPS}, the run ends at step 40"),
         (["experiment=smoke"], "trainer.validate_every: "),
