@@ -123,7 +123,7 @@ def test_another_evaluation_leaves_the_training_as_it_is(copy: Path, whole: Path
     assert found["metrics"] == before["metrics"]
     assert "loss/total" in found["metrics"]
     assert found["resumed"][0]["changes"] == {
-        "evaluation.dt": [0.1, 0.05], "evaluation.starts": [4, 2], "trainer.accelerator": ["auto", "cpu"],
+        "evaluation.dt": [0.25, 0.05], "evaluation.starts": [4, 2], "trainer.accelerator": ["auto", "cpu"],
     }  # fmt: skip
     rows, first = curve(copy), [row for row in curve(whole) if int(row["step"]) < STEPS]
     assert rows[: len(first)] == first
