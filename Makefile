@@ -41,7 +41,7 @@ lint: $(STAMP) ## ruff and mypy
 
 .PHONY: test
 test: lint ## lint, then the tests that are not slow; more options in ARGS
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 $(ARGS)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal $(ARGS)
 
 .PHONY: test-faults
 test-faults: $(STAMP) ## every injected fault, the long ones too; prints how many cases each test tried

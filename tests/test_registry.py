@@ -50,6 +50,7 @@ GROUPS = {
     "loss": "hno.losses",
     "source": "hno.sources",
     "optimizer": "hno.optimizers",
+    "callback": "hno.callbacks",
 }
 """The entry-point group of every kind."""
 NAMES = ("zoo_for_tests", "zoo_for_tests.savanna", "pond_for_tests")

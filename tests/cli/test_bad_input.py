@@ -77,7 +77,7 @@ def test_impossible_types(command: Command, entry: str, types: str, message: str
 
 
 def test_types_outside_the_range_are_a_visible_warning(command: Command) -> None:
-    run = command("train", *SMOKE, "trainer.max_steps=1", "evaluation.types=[[0.5,1]]")
+    run = command("train", *SMOKE, "trainer.max_steps=1", "evaluation.types=[[0.5,1]]", "evaluation.starts=1")
     assert run.code == 0, run.text
     assert "ExtrapolationWarning: theta = (0.5, 1.0) lies outside the types [1.0, 1.0] to [5.0, 5.0]" in run.text
     assert "extrapolate" in (run.folder / "train.log").read_text()

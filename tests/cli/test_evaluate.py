@@ -192,6 +192,7 @@ def no_search(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(label_data, "tie_states", lambda game, theta, count, draw: draw(2 * count)[count:])
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_search")
 def test_without_a_safe_start_every_section_says_so(command: Command, random_checkpoint: Path) -> None:
     both = f"checkpoint=[{random_checkpoint},{random_checkpoint}]"

@@ -18,6 +18,7 @@ from tests.fakes import fake_labels
 FAST = ("workers=1", "starts=4", "dt=0.1", "theta=1,1")
 
 
+@pytest.mark.slow
 def test_the_game_is_solved_online_beside_the_learned_policy(command: Command, random_checkpoint: Path) -> None:
     run = command("evaluate", f"checkpoint={random_checkpoint}", *FAST, "online=2", "online_interval=3")
     assert run.code == 0, run.text

@@ -31,7 +31,7 @@ from tests.cli.conftest import SMOKE, Command, Outcome
 from tests.fakes import fake_labels
 
 GAMES, OPERATORS, ACTIVATIONS = ("narrow_road", "lane_change", "drone"), ("hno", "sno"), ("tanh", "sin", "relu")
-FAST = {("narrow_road", "sno", "sin"), *((game, "hno", "sin") for game in GAMES)}
+FAST = {("narrow_road", "sno", "sin"), ("narrow_road", "hno", "sin"), ("drone", "hno", "sin")}
 KEYS = {
     "status", "reason", "game", "operator", "activation", "seed", "steps", "training_hash", "seconds", "table",
     "versions", "config", "episodes",

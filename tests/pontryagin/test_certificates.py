@@ -16,7 +16,7 @@ from hno.pontryagin.newton import Newton, newton
 from hno.pontryagin.solve import solve_on_mesh
 from hno.types import Status
 from tests.lq import LinearQuadratic, open_loop_nash, quadratic, random_game
-from tests.pontryagin.encounters import FIRST, NAMES, starts, types
+from tests.pontryagin.encounters import FIRST, starts, types
 
 
 def terminal_game(label_step: float = 0.1) -> LinearQuadratic:
@@ -234,7 +234,7 @@ def test_a_game_with_one_optimum_has_no_global_gap():
     assert found.global_gap.max() < 1e-3
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", FIRST)
 def test_every_extremal_carries_its_certificates(name):
     game = make(name)
     found = solve(game, starts(game, 3), types(3, 1, 5))

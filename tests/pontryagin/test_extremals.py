@@ -13,7 +13,7 @@ from hno.games.base import own_costate
 from hno.pontryagin import Solver, solve
 from hno.pontryagin.adjoint import pmp_rate
 from hno.types import Extremal, Status
-from tests.pontryagin.encounters import NAMES, central_difference, starts, types
+from tests.pontryagin.encounters import FIRST, central_difference, starts, types
 
 
 @functools.cache
@@ -68,7 +68,7 @@ def replay(game: Game, x0: Tensor, theta: Tensor, u: Tensor) -> tuple[Tensor, Te
     return torch.stack(path, -3), game.terminal_value(x) - spent
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", FIRST)
 def test_the_controls_drive_the_states(name):
     game, found = solved(name)
     x, value = replay(game, found.x[:, 0], found.theta, control_course(game, found, 4))
@@ -76,7 +76,7 @@ def test_the_controls_drive_the_states(name):
     torch.testing.assert_close(value, found.value[:, 0], rtol=1e-3, atol=1e-3)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", FIRST)
 def test_own_costates_are_the_gradient_of_the_own_value_at_everybodys_fixed_controls(name):
     game, found = solved(name)
     u = control_course(game, found, 4)
@@ -85,7 +85,7 @@ def test_own_costates_are_the_gradient_of_the_own_value_at_everybodys_fixed_cont
     assert ((found.costate[:, 0] - slope).abs() / scale).max() < 1e-2
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", FIRST)
 def test_no_player_gains_by_changing_its_own_controls_a_little(name):
     game, found = solved(name)
     u = control_course(game, found, 4)
@@ -101,7 +101,7 @@ def test_no_player_gains_by_changing_its_own_controls_a_little(name):
         assert gain[..., player].max() < 1e-3
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", FIRST)
 def test_the_hamiltonian_of_the_shared_problem_is_conserved(name):
     """Players of these games share one penalty, so <lambda_11, f_1> + <lambda_22, f_2> - efforts - penalty is constant.
 
@@ -117,7 +117,7 @@ def test_the_hamiltonian_of_the_shared_problem_is_conserved(name):
     assert (energy.amax(1) - energy.amin(1)).max() < 2e-4 * penalty.max().clamp_min(1000)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", FIRST)
 def test_both_ends_meet_their_conditions(name):
     game, found = solved(name)
     torch.testing.assert_close(found.x[:, 0], starts(make(name), 2), rtol=0, atol=1e-12)
@@ -128,7 +128,7 @@ def test_both_ends_meet_their_conditions(name):
     assert found.costate[:, -1, [0, 1], [1, 0]].abs().max() == 0
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", FIRST)
 def test_controls_maximise_the_hamiltonian_within_their_box(name):
     game, found = solved(name)
     torch.testing.assert_close(found.u, game.optimal_control(found.x, found.costate), rtol=1e-7, atol=1e-7)

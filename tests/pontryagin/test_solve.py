@@ -84,6 +84,7 @@ def test_the_same_call_gives_the_same_result_whatever_the_global_generator_holds
         assert torch.equal(one.nan_to_num(7), two.nan_to_num(7)), name
 
 
+@pytest.mark.slow
 def test_inference_mode_changes_nothing():
     game, theta = make("narrow_road"), types(2, 1, 5)
     x0 = starts(game, 2)

@@ -43,9 +43,7 @@ def test_a_table_has_every_step_of_every_player(tmp_path: Path) -> None:
             row for row in csv.DictReader(file) if (row["episode"], row["of"], row["player"]) == ("0", "policy", "2")
         ]
     assert len(rows) == len(played.t)
-    states = [
-        [float(row[f"state {name}"]) for name in ("px [m]", "py [m]", "psi [rad]", "v [m/s]")] for row in rows
-    ]
+    states = [[float(row[f"state {name}"]) for name in ("px [m]", "py [m]", "psi [rad]", "v [m/s]")] for row in rows]
     np.testing.assert_allclose(states, played.x[:, 1], rtol=1e-4, atol=1e-4)
     across = [float(row["x [m]"]) for row in rows]
     np.testing.assert_allclose(across, 70 - played.x[:, 1, 0], rtol=1e-4, atol=1e-4)
