@@ -14,6 +14,7 @@ from tests.cli.test_main import python
 Printed = pytest.CaptureFixture[str]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("cache")
 def test_the_new_game_passes_its_test_and_trains_once_it_is_installed(tmp_path: Path, capsys: Printed) -> None:
     folder, site = tmp_path / "new", tmp_path / "site"

@@ -72,6 +72,7 @@ def test_without_coupling_every_player_solves_its_own_regulator():
     torch.testing.assert_close(found.u[..., 0], -root * found.x[..., 0], rtol=0, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_the_same_call_gives_the_same_result_whatever_the_global_generator_holds():
     game = make("lane_change")
     x0, theta = starts(game, 2), types(2, 3, 3)
