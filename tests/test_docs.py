@@ -188,6 +188,7 @@ def test_the_tutorial_ends_with_a_safe_controller(shell: Shell) -> None:
     assert collisions < 0.01 * starts
 
 
+@pytest.mark.slow
 def test_the_notebook_prints_what_it_shows(shell: Shell) -> None:
     """Cells run one after the other, without Jupyter."""
     cells = [cell for cell in json.loads(NOTEBOOK.read_text())["cells"] if cell["cell_type"] == "code"]

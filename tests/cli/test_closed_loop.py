@@ -89,6 +89,7 @@ def test_validation_plays_the_safe_held_out_starts(
     assert rest.results["checkpoint"] == "last.ckpt"
 
 
+@pytest.mark.slow
 def test_validation_starts_of_chosen_types(command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     given: list[list[Extremal]] = []
     begin = ClosedLoopValidation.begin
@@ -236,6 +237,7 @@ def test_an_error_that_explodes_is_divergence(command: Command, monkeypatch: pyt
     assert run.results["checkpoint"] == "best.ckpt"
 
 
+@pytest.mark.slow
 def test_the_best_checkpoint_of_an_earlier_run_in_the_folder_is_not_ours(command: Command) -> None:
     assert command("train", *SMOKE, "trainer.max_steps=2").code == 0
     run = command("train", *SMOKE, "trainer.max_steps=3", "seed=7", "evaluation.clearance=50")

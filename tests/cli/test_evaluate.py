@@ -289,6 +289,7 @@ def test_models_are_compared_on_the_same_starts(command: Command, random_checkpo
     assert "compared against random/last.ckpt" in run.text
 
 
+@pytest.mark.slow
 def test_every_model_meets_the_same_safe_starts(
     command: Command, random_checkpoint: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

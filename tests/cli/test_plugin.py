@@ -83,6 +83,7 @@ def test_constants_of_a_registered_game(command: Command) -> None:
     assert hno.load_policy(run.folder / "last.ckpt").game.radius == 0.3
 
 
+@pytest.mark.slow
 def test_default_types_stay_within_the_game(command: Command) -> None:
     games.register("walkers")(Walkers)
     run = command("train", *SMOKE, "game=walkers", "trainer.max_steps=1")

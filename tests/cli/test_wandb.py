@@ -54,6 +54,7 @@ def check_jobs(folder: Path, games: str, operators: str, activations: str) -> No
     assert all((job / "csv" / "metrics.csv").is_file() for job in folders)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("cache")
 def test_multirun_yields_a_wandb_run_and_results_per_job(tmp_path: Path) -> None:
     chosen = "narrow_road", "hno,sno", "tanh"

@@ -91,7 +91,7 @@ def test_the_costate_is_the_derivative_of_the_value() -> None:
 
 
 @pytest.mark.parametrize("members", [1, pytest.param(3, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("mapped", [False, True])
+@pytest.mark.parametrize("mapped", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_the_answer_compiles(members: int, mapped: bool) -> None:
     policy, points = asked(members)
     torch.compiler.reset()

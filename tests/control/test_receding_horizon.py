@@ -94,6 +94,7 @@ def test_a_failed_solve_is_counted_and_the_last_plan_followed() -> None:
     assert patient.solves.tolist() == [1, 1]
 
 
+@pytest.mark.slow
 def test_without_any_solution_the_failures_are_all_there() -> None:
     policy = RecedingHorizon(Walkers(), settings=HOPELESS)
     found = played(policy)

@@ -248,6 +248,7 @@ def test_every_extremal_carries_its_certificates(name):
     assert found.reintegration.max() <= Solver().reintegration
 
 
+@pytest.mark.slow
 def test_the_label_is_among_its_alternatives_also_after_it_was_solved_again_on_its_kinks():
     game = make("drone")
     found = solve(game, starts(game, 16), types(16, 5, 5))

@@ -96,6 +96,7 @@ def test_inference_mode_changes_nothing():
         assert torch.equal(getattr(outside, name).nan_to_num(7), getattr(inside, name).nan_to_num(7)), name
 
 
+@pytest.mark.slow
 def test_rows_do_not_influence_each_other():
     game = make("narrow_road")
     x0, theta = starts(game, 2), torch.tensor([[5.0, 1.0], [3.0, 5.0]], dtype=torch.float64)
