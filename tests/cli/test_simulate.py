@@ -294,7 +294,7 @@ def test_a_signal_ends_it_with_one_line(one, number: int) -> None:
 def test_the_page_in_a_browser(one, tmp_path) -> None:
     """Everything is drawn, keys drive, names of files are text, nothing is asked of anybody else, nothing is said."""
     playwright = pytest.importorskip("playwright.sync_api", reason="needs the package playwright")
-    with Playing([one], player=1, speed=0.25) as playing, playwright.sync_playwright() as started:
+    with Playing([one], player=1, speed=0.05) as playing, playwright.sync_playwright() as started:
         context = started.chromium.launch_persistent_context(
             tmp_path, executable_path=shutil.which("chromium"), args=list(ARGUMENTS), headless=True
         )
