@@ -176,7 +176,15 @@ def own_cache(labels: Callable[..., Extremal], tmp_path: Path) -> Path:
     return tmp_path / "labels"
 
 
-@pytest.mark.parametrize(("split", "damage"), [("train", "truncated"), ("test", "flipped")])
+@pytest.mark.parametrize(
+    ("split", "damage"),
+    [
+        ("train", "truncated"),
+        ("test", "flipped"),
+        pytest.param("train", "flipped", marks=pytest.mark.slow),
+        pytest.param("test", "truncated", marks=pytest.mark.slow),
+    ],
+)
 def test_damaged_label_file(command: Command, own_cache: Path, split: str, damage: str) -> None:
     (path,) = own_cache.rglob(f"1-1_{split}*/shard-*.safetensors")
     sound = path.read_bytes()

@@ -233,7 +233,7 @@ def test_residuals_are_a_section_that_can_be_switched_off(command: Command, rand
 
 @pytest.mark.usefixtures("no_search")
 def test_robustness_is_a_section_on_request(command: Command, random_checkpoint: Path) -> None:
-    arguments = (f"checkpoint={random_checkpoint}", "theta=1,1", "residuals=false", *FAST)
+    arguments = (f"checkpoint={random_checkpoint}", "theta=1,1;2,2", "residuals=false", *FAST)
     asked = (*arguments, "robustness=true", "conditions.heading={drift: 0.1, components: [2]}")
     run = command("evaluate", *asked)
     assert run.code == 0, run.text

@@ -27,6 +27,8 @@ from tests.walkers import Walkers
 
 SWEEPS = sorted((Path(__file__).parents[2] / "sweeps").glob("*.yaml"))
 GAMES, OPERATORS = ("narrow_road", "lane_change", "drone"), ("hno", "sno")
+RATES = {"tanh": 3e-3, "sin": 3e-3, "relu": 1e-2}
+STARTS = {"narrow_road": 200, "lane_change": 200, "drone": 60}
 
 
 def read(path: Path) -> dict[str, Any]:
@@ -118,13 +120,19 @@ def grid(command: Command, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> I
 
 
 def test_the_papers_grid_takes_every_activation_at_its_own_rate(grid: Any) -> None:
-    starts = {"narrow_road": 200, "lane_change": 200, "drone": 60}
     assert grid("-m", "seed=1", "activation=sin") == [
-        (game, operator, "sin", 1, 3e-3, starts[game], True, 25, 2000) for game, operator in product(GAMES, OPERATORS)
+        (game, operator, "sin", 1, 3e-3, STARTS[game], True, 25, 2000) for game, operator in product(GAMES, OPERATORS)
     ]
     assert grid("-m", "seed=1", "game=drone", "operator=hno") == [
-        ("drone", "hno", activation, 1, rate, 60, True, 25, 2000)
-        for activation, rate in (("tanh", 3e-3), ("sin", 3e-3), ("relu", 1e-2))
+        ("drone", "hno", activation, 1, rate, 60, True, 25, 2000) for activation, rate in RATES.items()
+    ]
+
+
+@pytest.mark.slow
+def test_the_papers_grid_is_every_combination(grid: Any) -> None:
+    assert grid("-m", "seed=1") == [
+        (game, operator, activation, 1, RATES[activation], STARTS[game], True, 25, 2000)
+        for game, operator, activation in product(GAMES, OPERATORS, RATES)
     ]
 
 

@@ -213,16 +213,24 @@ def test_a_damaged_file_is_solved_again_and_no_other(tmp_path: Path, calls: list
     assert calls == [REQUEST.theta]
 
 
+@pytest.mark.parametrize(
+    ("processes", "sizes"), [((2,), (1, 4)), pytest.param((1, 2), (1, 3, 4), marks=pytest.mark.slow)]
+)
 def test_labels_are_equal_bit_for_bit_however_they_are_split(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, labels: Callable[..., Extremal]
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    labels: Callable[..., Extremal],
+    processes: tuple[int, ...],
+    sizes: tuple[int, ...],
 ) -> None:
     """Solved at once, shard by shard in one process or in two, and as an extension of a smaller set."""
     game, once = make("narrow_road"), bits(labels("narrow_road"))
     assert bool((labels("narrow_road").status == Status.CONVERGED).all())
     for module in (label_data, shards):
         monkeypatch.setattr(module, "SHARD", 2)
-    assert bits(labels_for(game, [TRAIN], tmp_path / "two", workers=2)[0][0]) == once
-    for starts in (1, 4):
+    for workers in processes:
+        assert bits(labels_for(game, [TRAIN], tmp_path / str(workers), workers=workers)[0][0]) == once
+    for starts in sizes:
         (found,), _ = labels_for(game, [TRAIN._replace(starts=starts)], tmp_path / "grown", workers=1)
     assert bits(found) == once
 

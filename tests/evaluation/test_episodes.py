@@ -182,7 +182,7 @@ def test_three_dimensions_and_the_size_of_the_file() -> None:
 
     kept = kept_of(game, hover, found)
     assert kept["dimensions"] == 3
-    assert len(json.dumps(kept)) / len(kept["episodes"]) < 12000
+    assert len(json.dumps(kept)) / len(kept["episodes"]) < 8000
 
 
 def test_one_player_alone_has_episodes_without_a_radius() -> None:

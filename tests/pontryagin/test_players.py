@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import pytest
 import torch
 from torch import Tensor
@@ -58,7 +60,12 @@ def test_three_players_who_keep_distance_pairwise_are_solved():
     assert stalled.status.tolist() == [Status.STALLED]
 
 
-def test_renaming_three_interchangeable_players_renames_the_solution():
+@pytest.mark.parametrize(
+    "orders",
+    [((1, 0, 2), (1, 2, 0)), pytest.param(tuple(itertools.permutations(range(3))), marks=pytest.mark.slow)],
+    ids=["two that all others follow from", "all"],
+)
+def test_renaming_three_interchangeable_players_renames_the_solution(orders):
     """Where the best equilibrium leads; two that cost the same may change places."""
     game = Merging()
     check_game(game)
@@ -69,7 +76,7 @@ def test_renaming_three_interchangeable_players_renames_the_solution():
     lead = (ranked[:, 0] - ranked[:, 1]) / ranked[:, 0].abs().clamp_min(1)
     rows = lead > 1e-6
     assert rows.sum() >= 3
-    for order in ((1, 0, 2), (1, 2, 0)):  # all others follow from these two
+    for order in orders:
         renamed = solve(game, x0[:, order], theta[:, order])
         torch.testing.assert_close(renamed.value[rows], found.value[:, :, order][rows], rtol=1e-6, atol=1e-6)
         torch.testing.assert_close(renamed.x[rows], found.x[:, :, order][rows], rtol=0, atol=1e-6)

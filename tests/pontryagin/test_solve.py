@@ -99,10 +99,10 @@ def test_inference_mode_changes_nothing():
 @pytest.mark.slow
 def test_rows_do_not_influence_each_other():
     game = make("narrow_road")
-    x0, theta = starts(game, 2), torch.tensor([[5.0, 1.0], [3.0, 5.0]], dtype=torch.float64)
+    x0, theta = starts(game, 3), torch.tensor([[1.0, 1.0], [5.0, 1.0], [3.0, 5.0]], dtype=torch.float64)
     together = solve(game, x0, theta)
-    alone = join([solve(game, x0[row : row + 1], theta[row : row + 1]) for row in range(2)])
-    chunked = solve(game, x0, theta, Solver(chunk=1))
+    alone = join([solve(game, x0[row : row + 1], theta[row : row + 1]) for row in range(3)])
+    chunked = solve(game, x0, theta, Solver(chunk=2))
     for found in (alone, chunked):
         torch.testing.assert_close(found.x, together.x, rtol=0, atol=1e-7)
         torch.testing.assert_close(found.value, together.value, rtol=0, atol=1e-6)
