@@ -6,9 +6,8 @@ import functools
 import importlib.util
 import inspect
 import os
-import re
 import sys
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from importlib.metadata import EntryPoints, entry_points
 from pathlib import Path
 from typing import Any
@@ -25,6 +24,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 import hno
 from hno.cli.arguments import FOLDERS, Arguments, UsageError, rewritten
+from hno.cli.harmless import check_harmless
 from hno.cli.schema import GIVEN, REGISTRIES, S, SettingsError, places, validated
 from hno.cli.settings import COMMANDS, TrainSettings
 from hno.registry import options_of, plural, reason, unknown_name
@@ -113,48 +113,6 @@ def _node(group: str, name: str, options: Mapping[str, Any]) -> Any:
     return node
 
 
-HYDRA = {"run": None, "sweep": None, "sweeper": {"params", "max_batch_size"}, "job": {"name", "chdir"}}
-"""What a file of the user's may say of Hydra: the rest can name code, commands and files to write."""
-
-
-def _check_harmless(file: Path) -> None:
-    """Refuse a file of configuration that could run code: Hydra calls whatever `_target_` names.
-
-    Raises:
-        UsageError: with the file and what it says; also where it cannot be read.
-    """
-    try:
-        text = file.read_text(encoding="utf-8")
-        content = OmegaConf.to_container(OmegaConf.create(text), resolve=False)
-    except Exception as error:
-        raise UsageError(f"{file} cannot be read ({type(error).__name__}: {error}).") from error
-    entries: Any = content if isinstance(content, dict) else {}
-    hydra_entries: Any = entries.get("hydra") or {}
-    said = [f"hydra.{key}" for key, value in hydra_entries.items() if not _allowed(key, value)]
-    said += [str(key) for key in _keys(content) if key in ("_target_", "()")]
-    said += [f"hydra.{key}" for key in entries if str(key).startswith("hydra.")]
-    said += [str(entry) for entry in entries.get("defaults") or () if "@" in str(entry) and "hydra" in str(entry)]
-    said += re.findall(r"@package\s+\S*hydra\S*", text) + (["its place"] if "hydra" in file.parts[-3:-1] else [])
-    if said:
-        raise UsageError(
-            f"{file}: {said[0]} could run code or write files elsewhere. A file may choose, set options, and of hydra "
-            f"{', '.join(HYDRA)}; give the rest on the command line."
-        )
-
-
-def _allowed(key: str, value: Any) -> bool:
-    known = HYDRA.get(key, set())
-    return known is None or (isinstance(value, dict) and set(value) <= known and bool(known))
-
-
-def _keys(content: Any) -> Iterator[Any]:
-    """Every key of nested containers."""
-    if isinstance(content, dict):
-        yield from content
-    for entry in content.values() if isinstance(content, dict) else content if isinstance(content, list) else ():
-        yield from _keys(entry)
-
-
 def for_hydra(name: str, given: Arguments) -> list[str]:
     """Overrides as Hydra takes them, after the user's folder and the plugins are known to it.
 
@@ -166,7 +124,7 @@ def for_hydra(name: str, given: Arguments) -> list[str]:
         raise UsageError(f"--config-dir: there is no folder {folder}.")
     Folders.own = [] if folder is None else [Path(folder)]
     for file in sorted(path for own in Folders.own for path in own.rglob("*.yaml")):
-        _check_harmless(file)
+        check_harmless(file)
     Plugins.instance().register(Folders)
     composed, paths, many = groups(name), FOLDERS | places(COMMANDS[name]), "--multirun" in given.flags
     swept: Collection[str] = ()

@@ -137,9 +137,9 @@ def _named(task: Task, words: Sequence[str]) -> list[str]:
     if any(word.lstrip("+").startswith("hydra.sweep.subdir=") for word in words):
         return []
     hydra = HydraConfig.get()
-    pattern = str(OmegaConf.to_container(hydra.sweep)["subdir"])  # type: ignore[index,call-overload]
+    sweep: Any = OmegaConf.to_container(hydra.sweep)  # as it is written, with its interpolations
     keys = swept_keys(words, hydra.sweeper.get("params") or {})
-    return [f"hydra.sweep.subdir={quoted(named(pattern, keys, groups(task.name)))}"] if keys else []
+    return [f"hydra.sweep.subdir={quoted(named(str(sweep['subdir']), keys, groups(task.name)))}"] if keys else []
 
 
 def _here(words: Sequence[str]) -> list[str]:

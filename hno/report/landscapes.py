@@ -41,28 +41,8 @@ def chart() -> dict[str, Any]:
     """
     return {
         "padding": 4,
-        "signals": [
-            {"name": "width", "value": 300}, {"name": "height", "value": 260},
-            *({"name": name, "value": value} for name, value in SIGNALS.items()),
-            {"name": "pixel", "update": PIXEL.format("columns", "rows")},
-            {"name": "pointer", "on": [
-                {"events": "pointermove", "update": "[invert('x', x()), invert('y', y())]"}]},
-            {"name": "coarse", "update": PIXEL.format("coarse_points", "coarse_points")},
-        ],
-        "data": [
-            {"name": "grid", "values": []},
-            {"name": "raster", "source": "grid", "transform": [
-                {"type": "heatmap", "color": {"expr": "scale('color', datum.$value)"},
-                 "opacity": {"expr": "isValid(datum.$value) && isFinite(datum.$value) ? 1 : 0"}}]},
-            {"name": "shape", "values": []},
-            {"name": "contours", "source": "shape", "transform": [_contour({"signal": "levels"})]},
-            {"name": "barrier", "values": []},
-            {"name": "boundary", "source": "barrier", "transform": [_contour([0])]},
-            {"name": "arrows", "values": []},
-            {"name": "family", "values": []},
-            {"name": "sets", "source": "family", "transform": [
-                {**_contour({"signal": "level"}, "coarse"), "field": "raster"}]},
-        ],
+        "signals": _signals(),
+        "data": _data(),
         "scales": [
             {"name": "x", "type": "linear", "domain": {"signal": "x_ends"}, "range": "width", "zero": False},
             {"name": "y", "type": "linear", "domain": {"signal": "y_ends"}, "range": "height", "zero": False},
@@ -86,6 +66,34 @@ def chart() -> dict[str, Any]:
             ],
         }],
     }  # fmt: skip
+
+
+def _signals() -> list[dict[str, Any]]:
+    return [
+        {"name": "width", "value": 300}, {"name": "height", "value": 260},
+        *({"name": name, "value": value} for name, value in SIGNALS.items()),
+        {"name": "pixel", "update": PIXEL.format("columns", "rows")},
+        {"name": "pointer", "on": [
+            {"events": "pointermove", "update": "[invert('x', x()), invert('y', y())]"}]},
+        {"name": "coarse", "update": PIXEL.format("coarse_points", "coarse_points")},
+    ]  # fmt: skip
+
+
+def _data() -> list[dict[str, Any]]:
+    return [
+        {"name": "grid", "values": []},
+        {"name": "raster", "source": "grid", "transform": [
+            {"type": "heatmap", "color": {"expr": "scale('color', datum.$value)"},
+             "opacity": {"expr": "isValid(datum.$value) && isFinite(datum.$value) ? 1 : 0"}}]},
+        {"name": "shape", "values": []},
+        {"name": "contours", "source": "shape", "transform": [_contour({"signal": "levels"})]},
+        {"name": "barrier", "values": []},
+        {"name": "boundary", "source": "barrier", "transform": [_contour([0])]},
+        {"name": "arrows", "values": []},
+        {"name": "family", "values": []},
+        {"name": "sets", "source": "family", "transform": [
+            {**_contour({"signal": "level"}, "coarse"), "field": "raster"}]},
+    ]  # fmt: skip
 
 
 def _contour(levels: Any, pixel: str = "pixel") -> dict[str, Any]:
