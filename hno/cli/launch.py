@@ -139,7 +139,8 @@ def _named(task: Task, words: Sequence[str]) -> list[str]:
     hydra = HydraConfig.get()
     sweep: Any = OmegaConf.to_container(hydra.sweep)  # as it is written, with its interpolations
     keys = swept_keys(words, hydra.sweeper.get("params") or {})
-    return [f"hydra.sweep.subdir={quoted(named(str(sweep['subdir']), keys, groups(task.name)))}"] if keys else []
+    folder = quoted(named(str(sweep["subdir"]), keys, groups(task.name)))
+    return [f"hydra.sweep.subdir={folder}"] if keys else []
 
 
 def _here(words: Sequence[str]) -> list[str]:

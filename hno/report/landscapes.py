@@ -61,8 +61,9 @@ def chart() -> dict[str, Any]:
             "type": "group", "clip": True,
             "encode": {"update": {"width": {"signal": "width"}, "height": {"signal": "height"}}},
             "marks": [
-                _image(), _lines("contours", "ink", 0.8, 0.45), _lines("boundary", "danger", 2.5, 1), *_arrows(),
-                _sets(),
+                _image(), _lines("contours", {"signal": "ink"}, 0.8, 0.45),
+                _lines("boundary", {"signal": "danger"}, 2.5, 1), *_arrows(),
+                _lines("sets", {"scale": "types", "field": "theta"}, 2.2, 1),
             ],
         }],
     }  # fmt: skip
@@ -111,17 +112,10 @@ def _image() -> dict[str, Any]:
     return {"type": "image", "from": {"data": "raster"}, "encode": {"update": update}}
 
 
-def _lines(data: str, color: str, width: float, opacity: float) -> dict[str, Any]:
-    update = {"stroke": {"signal": color}, "strokeWidth": {"value": width}, "strokeOpacity": {"value": opacity}}
+def _lines(data: str, stroke: dict[str, str], width: float, opacity: float) -> dict[str, Any]:
+    update = {"stroke": stroke, "strokeWidth": {"value": width}, "strokeOpacity": {"value": opacity}}
     transform = [{"type": "geopath", "field": "datum.contour"}]
     return {"type": "path", "from": {"data": data}, "encode": {"update": update}, "transform": transform}
-
-
-def _sets() -> dict[str, Any]:
-    """One level set for each of several types."""
-    update = {"stroke": {"scale": "types", "field": "theta"}, "strokeWidth": {"value": 2.2}}
-    transform = [{"type": "geopath", "field": "datum.contour"}]
-    return {"type": "path", "from": {"data": "sets"}, "encode": {"update": update}, "transform": transform}
 
 
 def _arrows() -> list[dict[str, Any]]:
