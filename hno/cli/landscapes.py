@@ -8,7 +8,8 @@ import time
 from hno.cli.results import Results
 from hno.data.store import replace_whole
 from hno.evaluation.film import frames
-from hno.evaluation.landscape import landscape, script
+from hno.evaluation.landscape import landscape
+from hno.evaluation.page_script import LANDSCAPE, script
 from hno.evaluation.sections import Evaluation
 
 log = logging.getLogger(__name__)
@@ -35,7 +36,7 @@ def write_landscape(evaluation: Evaluation, results: Results, number: int = 0) -
     except ValueError as error:
         log.warning("There is no landscape: %s", error)
         return {}
-    name = f"landscape{number or ''}.js"
+    name = LANDSCAPE.format(number or "")
     replace_whole(results.path.parent / name, lambda draft: draft.write_text(text, encoding="utf-8"))
     results.time("landscape", time.perf_counter() - began)
     return {"landscape": name}

@@ -76,13 +76,10 @@ def run(task: Task, given: Arguments) -> int:
         return 0  # a dry run
     began, succeeded = False, False
 
-    def job(config: DictConfig) -> Objective:
+    def job(config: DictConfig) -> None:
         nonlocal began, succeeded
         began = True
-        settings = task.check(config)
-        found = perform(task, settings, folder)
-        succeeded = found is not None
-        return objective(settings, found)
+        succeeded = perform(task, task.check(config), folder) is not None
 
     register_plugins()
     try:

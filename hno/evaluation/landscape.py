@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -20,14 +19,10 @@ from hno.types import Extremal, Status
 
 log = logging.getLogger(__name__)
 
-LANDSCAPE = "landscape.js"
-"""File beside a run's results."""
 POINTS = 21
 """Points along each side of the grid at which Python's own values are written, unless there is a truth."""
 DIGITS = 5
 """Significant digits of written numbers."""
-
-
 FAILURES = ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError
 """What networks from outside may raise where they are traced: that costs the page its sliders alone."""
 Equilibria = Callable[..., Extremal]
@@ -69,11 +64,6 @@ def _program(policy: Feedback) -> tuple[dict[str, Any] | None, str | None]:
         reason = f"{type(error).__name__}: {error}".split("\n")[0][:300]
         log.warning("The page shows the default slice alone, since this controller has no graph: %s", reason)
         return None, reason
-
-
-def script(content: Mapping[str, Any]) -> str:
-    """A file that hands the content to the page that loads it; pages from disk can load scripts, but no JSON."""
-    return f"hnoLandscape({json.dumps(content, separators=(',', ':'), allow_nan=False)});\n"
 
 
 def _coordinates(game: Game) -> list[dict[str, Any]]:

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, TypeVar
 from yaml import YAMLError, safe_load  # type: ignore[import-untyped]  # yaml has no annotations
 
 from hno.data.folders import LOCK, held
+from hno.evaluation.page_script import check_script
 from hno.evaluation.starts import starts_from
 from hno.report.episode import Scene, episode
 from hno.report.records import Curves, Run, sentence, type_row
@@ -138,8 +139,10 @@ def _run(folder: Path, name: str, content: Mapping[str, Any]) -> Run:
         found["settings"]["checkpoint"] = str(run.checkpoint)
     found["command"] = _command(folder / ".hydra" / "hydra.yaml")
     found["overrides"] = tuple(shlex.split(found["command"] or "")[2:])
-    if isinstance(beside := content.get("landscape"), str) and (folder / Path(beside).name).is_file():
-        found["landscape"] = folder / Path(beside).name
+    with _noted(notes, "no landscape"):
+        if isinstance(beside := content.get("landscape"), str) and (folder / Path(beside).name).is_file():
+            check_script(folder / Path(beside).name)
+            found["landscape"] = folder / Path(beside).name
     found["table"] = _each(run.table, type_row, "row of the table", notes)
     with _noted(notes, "no learning curves"):
         found["curves"] = _curves(metrics) if metrics.exists() else {}

@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from hno.control import Feedback
-from hno.evaluation.landscape import LANDSCAPE, landscape, script
+from hno.evaluation.landscape import landscape
+from hno.evaluation.page_script import script
 from hno.export.page_program import answers_of_one_type, as_json, page_program
 from hno.export.trace import in_double, points, traced
 from hno.games import Game, make
@@ -26,6 +27,7 @@ from tests.report.folders import GRID5, make_results, write_run
 from tests.report.test_browser import Browser, context, playwright, pytestmark  # noqa: F401  # a fixture and a mark
 
 ASSETS = Path(landscapes.__file__).parent / "assets"
+LANDSCAPE = "landscape.js"
 TOLERANCE = 2e-3
 """Largest error of a graph in half precision, relative to the largest entry of the output."""
 
@@ -208,6 +210,33 @@ def test_a_file_that_has_gone_is_named(context, content, tmp_path):  # noqa: F81
     browser.page.close()
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "document.title = 'mine';\n",
+        "hnoLandscape({});document.title = 'mine';\n",
+        "hnoLandscape({});\ndocument.title = 'mine'\nhnoLandscape({});\n",
+        'hnoLandscape({"program":(document.title = 1)});\n',
+        "hnoLandscape({}) || hnoLandscape({});\n",
+        'hnoLandscape({"reason":"\u2028"});\n',
+        "\ufeffhnoLandscape({});\n",
+        'hnoLandscape({"players":2',
+        "hnoLandscape(" + "[" * 100_000 + ");\n",
+        "",
+    ],
+    ids=range(10),
+)
+def test_a_script_that_says_more_than_numbers_is_not_loaded(tmp_path, text):
+    """A page would run it, whoever wrote the folder."""
+    run_with(tmp_path, None)
+    place = tmp_path / "one"
+    (place / LANDSCAPE).write_text(text, encoding="utf-8")
+    (run,) = load(tmp_path).runs
+    assert run.landscape is None
+    assert any("no landscape: landscape.js is not hno's" in note for note in run.notes)
+    assert LANDSCAPE not in json.dumps(landscapes.entries(load(tmp_path).runs, tmp_path))
+
+
 def test_each_model_of_an_evaluation_has_its_own_landscape_or_none(tmp_path):
     results = make_results(
         "narrow_road", "sno", "tanh", 0, np.random.default_rng(0), GRID5[:1], landscape="landscape.js"
@@ -215,7 +244,7 @@ def test_each_model_of_an_evaluation_has_its_own_landscape_or_none(tmp_path):
     models = [{"landscape": "landscape.js"}, {}, {"landscape": "landscape2.js"}, {"landscape": "../../landscape.js"}]
     place = write_run(tmp_path / "one", results | {"models": models})
     for name in ("landscape.js", "landscape2.js"):
-        (place / name).write_text("")
+        (place / name).write_text(script({}))
     found = [run.landscape and run.landscape.name for run in load(tmp_path).runs]
     assert found == ["landscape.js", None, "landscape2.js", "landscape.js"]
     assert all(run.landscape is None or run.landscape.parent == place for run in load(tmp_path).runs)
