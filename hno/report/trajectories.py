@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import csv
+import functools
 import json
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -126,8 +126,9 @@ def write_commonroad(found: Sequence[Recorded], folder: Path) -> list[Path]:
     """A scenario for every episode of cars: the players as obstacles on their lanes; discs decide about collisions.
 
     Raises:
-        ValueError: players have no bodies, as drones.
+        ValueError: players have no bodies, as drones; or numbers are not finite.
     """
+    _check_finite(found)
     if not found[0].scene["bodies"]:
         raise ValueError("CommonRoad is for cars, and this game has players without bodies. Choose csv or mcap.")
     return [write_scenario(one, folder / f"episode_{one.number}.xml") for one in found]
@@ -138,8 +139,11 @@ def write_mcap(found: Sequence[Recorded], folder: Path) -> list[Path]:
 
     Raises:
         ModuleNotFoundError: mcap is missing.
+        ValueError: numbers are not finite, which JSON does not know.
     """
     from mcap.writer import Writer
+
+    _check_finite(found)
 
     def write(one: Recorded, draft: Path) -> None:
         with draft.open("wb") as file:
@@ -158,8 +162,15 @@ def write_mcap(found: Sequence[Recorded], folder: Path) -> list[Path]:
 
     paths = [folder / f"episode_{one.number}.mcap" for one in found]
     for one, path in zip(found, paths, strict=True):
-        replace_whole(path, lambda draft, one=one: write(one, draft))  # type: ignore[misc]
+        replace_whole(path, functools.partial(write, one))
     return paths
+
+
+def _check_finite(found: Sequence[Recorded]) -> None:
+    for one in found:
+        arrays = (part for way in one.paths for part in (way.places, way.states, way.controls, way.value))
+        if not all(np.isfinite(part).all() for part in arrays):
+            raise ValueError(f"Episode {one.number} has numbers that are not finite. Choose csv, which can hold them.")
 
 
 def _schema(one: Recorded) -> dict[str, Any]:
@@ -172,9 +183,8 @@ def _schema(one: Recorded) -> dict[str, Any]:
 
 def _messages(one: Recorded, way: Way) -> Iterator[tuple[float, dict[str, Any]]]:
     for t, place, x, u, value in zip(way.t, way.places, way.states, way.controls, way.value, strict=True):
-        if math.isfinite(float(np.sum(place) + np.sum(x) + np.sum(u) + value)):
-            named = {"states": _named(one.scene["states"], x), "controls": _named(one.scene["controls"], u)}
-            yield float(t), {"t": float(t), "position": _named("xyz", place), **named, "value": float(value)}
+        named = {"states": _named(one.scene["states"], x), "controls": _named(one.scene["controls"], u)}
+        yield float(t), {"t": float(t), "position": _named("xyz", place), **named, "value": float(value)}
 
 
 def _named(names: Sequence[str], values: Numbers) -> dict[str, float]:

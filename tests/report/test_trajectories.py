@@ -10,6 +10,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 import torch
+from safetensors.numpy import load_file, save_file
 
 from hno.cli.main import main
 from hno.control.rollout import Trajectory
@@ -65,6 +66,22 @@ def test_a_scenario_has_cars_of_the_scene_on_its_lanes(tmp_path: Path) -> None:
         places = [[float(point.findtext(axis, "nan")) for axis in "xy"] for point in car.iter("point")]
         np.testing.assert_allclose(places, game.positions(played.x)[:, player], atol=1e-4)
         assert [int(time.text or -1) for time in car.findall(".//time/exact")] == list(range(len(played.t)))
+
+
+@pytest.mark.parametrize("kind", ["commonroad", "mcap"])
+def test_numbers_that_are_not_finite_are_refused_by_formats_without_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str
+) -> None:
+    if kind == "mcap":
+        pytest.importorskip("mcap", reason="needs the package mcap")
+    kept(tmp_path, make("lane_change"))
+    arrays = load_file(tmp_path / PATHS)
+    arrays["0.x"][-1] = np.nan
+    save_file(arrays, tmp_path / PATHS)
+    assert main(["episodes", str(tmp_path), "--to", kind]) == 1
+    assert "Episode 0 has numbers that are not finite. Choose csv" in capsys.readouterr().err
+    assert not (tmp_path / "episodes").exists()
+    assert main(["episodes", str(tmp_path), "--to", "csv"]) == 0
 
 
 def test_drones_are_no_cars(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
