@@ -175,7 +175,7 @@ def test_the_landscape_fits_a_phone(context, content, tmp_path):  # noqa: F811
     browser = opened(context, tmp_path)
     browser.page.set_viewport_size({"width": 390, "height": 900})
     browser.page.locator("#land-learned canvas").wait_for()
-    browser.page.wait_for_function("document.documentElement.scrollWidth === 390")  # charts are drawn again
+    browser.until("document.documentElement.scrollWidth === 390")  # charts are drawn again
     browser.page.close()
 
 
