@@ -174,6 +174,7 @@ def follow(shell: Shell, *, everything: bool) -> None:
             shutil.copytree(shell.at / "outputs/smoke", shell.at / "outputs/crossing")
 
 
+@pytest.mark.slow
 def test_the_tutorial_can_be_followed(shell: Shell) -> None:
     follow(shell, everything=False)
     assert (shell.at / "outputs/smoke/report.html").exists()

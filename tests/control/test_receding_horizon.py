@@ -16,7 +16,7 @@ from tests.lq import open_loop_nash, random_game
 from tests.walkers import Walkers
 
 COARSE = Solver(newton=Newton(tolerance=1e-6), extra_nodes=0)
-HOPELESS = Solver(newton=Newton(tolerance=0.0, steps=2, full_steps=1))
+HOPELESS = Solver(newton=Newton(tolerance=0.0, steps=2, full_steps=1), extra_nodes=0)
 
 
 def walkers(count: int) -> tuple[Tensor, Tensor]:
@@ -31,7 +31,7 @@ def times(tau: float, rows: int) -> Tensor:
     return torch.full((rows,), tau)
 
 
-@pytest.mark.parametrize(("players", "interval"), [(2, 1), (2, 5), (3, 1)])
+@pytest.mark.parametrize(("players", "interval"), [(2, 1), (2, 5), pytest.param(3, 1, marks=pytest.mark.slow)])
 def test_without_disturbance_it_plays_the_open_loop_equilibrium(players: int, interval: int) -> None:
     """What holding the controls costs is of the first order in the control step."""
     game = random_game(players)

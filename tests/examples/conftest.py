@@ -13,6 +13,7 @@ from hno.data.curriculum import Curriculum
 from hno.games import Game, games
 from hno.losses import Objective, Scales, losses, make_objective
 from hno.operators import Architecture, Choice, ValueOperator, make_operator, networks
+from hno.pontryagin import Solver
 from hno.training import Fitted, Settings, fit
 from hno.training.module import TrainingModule
 from hno.training.optimizers import optimizers
@@ -25,6 +26,7 @@ FOLDER = Path(__file__).parents[2] / "examples"
 LABELS = {"value": {}, "costate": {}}
 """The terms that compare with labels."""
 SMALL = Choice("deeponet", {"width": 32, "depth": 3})
+MESH = Solver(extra_nodes=20)
 
 
 @pytest.fixture
@@ -79,8 +81,8 @@ def train(cache: Path, tmp_path: Path) -> Train:
         network: Choice = SMALL,
         sampler: Mapping[str, Any] | None = None,
         optimizer: Mapping[str, Any] | None = None,
-        trajectories: int = 6,
-        steps: int = 200,
+        trajectories: int = 4,
+        steps: int = 100,
         record: Callable[[Game, Architecture], Mapping[str, Any]] | None = None,
     ) -> Trained:
         torch.manual_seed(0)
@@ -90,7 +92,7 @@ def train(cache: Path, tmp_path: Path) -> Train:
         data = GameData(
             game,
             objective.streams(exact_terminal=operator.meets_terminal),
-            labels=LabelPlan(types=types, trajectories=trajectories, validation=2, cache=cache, workers=1),
+            labels=LabelPlan(types=types, trajectories=trajectories, validation=1, cache=cache, solver=MESH, workers=1),
             collocation=Collocation(make_sampler(sampler or {"box": 1.0}), Curriculum(0, 0)),
             batch_sizes={"bvp": 256, "interior": 64, "terminal": 64},
         )

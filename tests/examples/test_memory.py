@@ -49,7 +49,7 @@ def test_each_player_answers_to_its_own_type_and_to_the_belief_in_the_other():
 def test_the_belief_moves_to_the_true_type(train: Train):
     """A player does exactly what its own type predicts, so nothing that is seen speaks against it."""
     game = Tracking()
-    trained = train(game, [(1, 1), (1, 5), (5, 1), (5, 5)], steps=200)
+    trained = train(game, [(1, 1), (1, 5), (5, 1), (5, 5)])
     policy = Recorded(game, Feedback(trained.operator), torch.tensor([1.0, 5.0]), doubt=0.05)
     truth = torch.tensor([[0, 0], [0, 1], [1, 0], [1, 1]]).repeat(8, 1)
     x0 = game.initial_box.sample(len(truth), torch.Generator().manual_seed(3))
