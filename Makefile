@@ -43,6 +43,10 @@ lint: $(STAMP) ## ruff and mypy
 test: lint ## lint, then the tests that are not slow; more options in ARGS
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal $(ARGS)
 
+.PHONY: test-slow
+test-slow: $(STAMP) ## the tests that take minutes, hours in all; more options in ARGS
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal -m slow $(ARGS)
+
 .PHONY: test-faults
 test-faults: $(STAMP) ## every injected fault, the long ones too; prints how many cases each test tried
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest tests/faults -m "slow or not slow" -rpP $(ARGS)
