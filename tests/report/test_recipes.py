@@ -20,6 +20,7 @@ from hno.report.recipes import Recipe, best, by_type, headline, recipes, rivals,
 from hno.report.records import Row, Run, type_row
 from hno.report.runs import load
 from hno.report.tables import recipe_table
+from hno.report.verdicts import denominator
 from tests.report.folders import make_results, row, write_run
 
 FIRST, SECOND = (1.0, 1.0), (5.0, 5.0)
@@ -263,3 +264,34 @@ def test_recipes_that_no_command_line_tells_apart_are_named_by_their_settings(tm
         write(tmp_path / str(number), 0, (0, 0), config={**bits, "seed": 0})
     names = [one.variant for one in recipes(loaded(tmp_path))]
     assert len(set(names)) == 9
+
+
+def test_of_several_rivals_each_p_value_is_corrected(tmp_path):
+    """6 and 7 starts from which one alone collides: the larger p-value stays, and the smaller one is doubled."""
+    started(tmp_path, "hno", "0" * 100)
+    for name, collisions in (("sno", 6), ("own", 7)):
+        started(tmp_path, name, "1" * collisions + "0" * (100 - collisions))
+    found = recipes(loaded(tmp_path))
+    chosen = best(found)[0]
+    p_values = {one.recipe.operator: one.p_value for one in rivals(chosen, found)}
+    assert p_values == {"sno": pytest.approx(2 / 2**6), "own": pytest.approx(2 * 2 / 2**7)}
+
+
+def test_values_that_begin_alike_are_named_whole(tmp_path):
+    for number in range(2):
+        write(tmp_path / str(number), 0, (0, 0), config={"files": "a" * 60 + str(number), "seed": 0})
+    assert {one.variant[-2:] for one in recipes(loaded(tmp_path))} == {"a0", "a1"}
+
+
+def test_every_start_that_does_not_count_has_a_reason(tmp_path):
+    """Of 103 starts one collides whatever anyone does; of two nothing is said."""
+    write(tmp_path, 0, (0, 0), config={"evaluation": {"safe": True}, "seed": 0})
+    content = json.loads((tmp_path / "results.json").read_text())
+    content["table"] = [row(FIRST, 0, 100) | {"starts": 103, "inevitable": 1, "marginal": 0, "unsolved": 0}]
+    (tmp_path / "results.json").write_text(json.dumps(content))
+    (found,) = recipes(loaded(tmp_path))
+    said = denominator(found)
+    assert said.startswith(
+        "100 of 103 starts count; left out: 1 whose equilibrium collides, 2 for reasons that the table does not name."
+    )
+    assert said.endswith("They were drawn until so many were safe; those that were not are not in the table.")
