@@ -14,11 +14,14 @@ from hno.evaluation.format import NOT_AVAILABLE
 from hno.evaluation.landscape import landscape
 from hno.evaluation.off_labels import OffLabels, errors, regions
 from hno.games import Game, make
+from hno.games.base import own_costate
 from hno.types import Extremal, Field, Points, Status
 from tests.fakes import fake_labels
 from tests.operators.conftest import small_operator
 
 SCALE = torch.tensor(1.0, dtype=torch.float64)
+TAU = 1.0
+"""Time to go, less than the whole game, s."""
 
 
 def operator(game: Game, found: Extremal, factor: float) -> Any:
@@ -28,6 +31,7 @@ def operator(game: Game, found: Extremal, factor: float) -> Any:
     def field(points: Points) -> Field:
         value, costate = found.value[known, 0], found.costate[known, 0]
         torch.testing.assert_close(points.x, found.x[known, 0])
+        assert bool((points.tau == TAU).all())
         return Field(factor * value, value, factor * costate)
 
     return SimpleNamespace(game=game.double(), field=field, value_scale=SCALE)
@@ -38,11 +42,26 @@ def test_errors_are_relative_to_the_truth_and_of_what_was_found(factor: float) -
     game = make("narrow_road")
     status = [Status.CONVERGED] * 5 + [Status.STALLED]
     found = fake_labels(game, count=6, status=status, clearance=[1, 1, -1, -1, 1, 1])
-    row = errors(operator(game, found, factor), found, 1.0)
+    row = errors(operator(game, found, factor), found, TAU)
     assert (row["points"], row["solved"], row["safe"]) == (6, 5, 0.6)
     assert row["relative_value"] == pytest.approx(factor - 1)
     assert row["relative_gradient"] == pytest.approx(factor - 1)
     assert row["value_error"] == pytest.approx((factor - 1) * row["value"])
+
+
+def test_gradients_are_measured_in_half_widths_of_the_box() -> None:
+    """An error in one state weighs as much as a change of the value over half its range."""
+    game = make("narrow_road").double()
+    found, half, errs = fake_labels(game, count=3), game.state_box.width / 2, list[float]()
+    slope = own_costate(found.costate[:, 0])
+    size = (slope * half).flatten(1).norm(dim=-1).mean()
+    for state in range(game.state_dim):
+        off = torch.zeros_like(found.costate[:, 0])
+        off[:, 0, 0, state] = 1.0
+        field = Field(found.value[:, 0], found.value[:, 0], found.costate[:, 0] + off)
+        wrong: Any = SimpleNamespace(game=game, field=lambda points, field=field: field, value_scale=SCALE)
+        errs.append(errors(wrong, found, TAU)["relative_gradient"])
+    assert errs == pytest.approx((half[0] / size).tolist())
 
 
 def test_where_nothing_was_found_there_is_no_error() -> None:

@@ -39,7 +39,8 @@ def small(game: str, function: str) -> ValueOperator:
 
 
 def equilibria(game: Game, x0: Tensor, theta: Tensor, tau: float) -> Extremal:
-    """Made-up ones, of which the first was not found."""
+    """Made-up ones at the time to go of a slice, of which the first was not found."""
+    assert tau == game.horizon / 2
     status = [Status.STALLED, *[Status.CONVERGED] * (len(x0) - 1)]
     return fake_labels(game, theta[0].tolist(), len(x0), start=x0, status=status)
 
