@@ -42,20 +42,37 @@ async function draw(host, name, data, values = {}, renderer = "svg") {
   return made.view;
 }
 
-function drawHeat(host) {
-  const cells = DATA.maps[host.dataset.of];
+/** The heat map of a card: of a recipe in the page, of a single run in its part. */
+const mapOf = ({ card, run }) => (run === undefined ? Promise.resolve(DATA.maps[card]) : part(Number(run)).then((found) => found.map));
+
+async function drawHeat(host) {
+  const card = host.closest(".map");
+  const { cells } = await mapOf(card.dataset).catch((error) => {
+    host.textContent = error.message;
+    return {};
+  });
+  if (!cells) return;
   const columns = new Set(cells.map((cell) => cell.theta[0])).size;
   const step = Math.max(13, Math.min(38, Math.floor((host.clientWidth - 44) / columns)));
   const values = { x_step: step, y_step: step, small: step < 26, bound: $("shown").value };
-  draw(host, "heat", { cells }, values).then((view) =>
-    view?.addEventListener("click", (_event, item) => {
-      const theta = item?.datum?.theta;
-      if (!theta || !$("player")) return;
-      choose_type(`(${theta.join(", ")})`, DATA.members[host.dataset.of]);
-      $("episodes").scrollIntoView();
-    }),
-  );
+  const view = await draw(host, "heat", { cells }, values);
+  view?.addEventListener("click", (_event, item) => {
+    const theta = item?.datum?.theta;
+    if (!theta || !$("player")) return;
+    choose_type(`(${theta.join(", ")})`, DATA.members[card.dataset.card]);
+    $("episodes").scrollIntoView();
+  });
 }
+
+for (const numbers of all(".numbers"))
+  numbers.addEventListener("toggle", async () => {
+    if (numbers.querySelector(".scroll")) return;
+    const box = numbers.appendChild(element("div", { className: "scroll" }));
+    mapOf(numbers.closest(".map").dataset).then(
+      (found) => box.append(tableOf(found)),
+      (error) => box.append(error.message),
+    );
+  });
 
 function drawComparison(host) {
   const rows = DATA.comparison.filter((row) => row.game === host.dataset.of && (row.seed === null || matches(row)));
@@ -113,6 +130,18 @@ const watcher = new IntersectionObserver(
   { rootMargin: "300px" },
 );
 for (const host of pending) watcher.observe(host);
+
+/** Do something once: when a part of the page comes into view, or before it is printed. */
+function whenSeen(host, then) {
+  const once = () => {
+    seen.disconnect();
+    removeEventListener("beforeprint", once);
+    then();
+  };
+  const seen = new IntersectionObserver((entries) => entries.some((entry) => entry.isIntersecting) && once(), { rootMargin: "300px" });
+  seen.observe(host);
+  addEventListener("beforeprint", once);
+}
 
 const FIRST = 12;
 let unfolded = false;

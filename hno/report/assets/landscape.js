@@ -2,10 +2,7 @@
 const [FINE, COARSE, ARROWS, TYPES] = [33, 17, 9, 5];
 /** Largest difference between the values of this page and Python's, relative to |value| + median |value|. */
 const TOLERANCE = 0.01;
-const land = { content: null, evaluate: null, waiting: null, error: null, turn: 0, across: "", up: "", tau: 0, theta: [], at: {} };
-
-/** A file of a run calls this. */
-window.hnoLandscape = (content) => land.waiting?.(content);
+const land = { content: null, evaluate: null, file: null, error: null, turn: 0, across: "", up: "", tau: 0, theta: [], at: {} };
 
 const coordinate = (name) => land.content.coordinates.find((one) => one.name === name);
 const dot = (a, b, from = 0) => a.reduce((sum, one, k) => sum + one * b[from + k], 0);
@@ -333,15 +330,19 @@ function received(content) {
   resetLandscape();
 }
 
-/** Load the file of a run; a page from disk may load scripts only. */
-function loadLandscape() {
+/** Load the file of the chosen run, and show it once the section is seen. */
+async function loadLandscape() {
   const { src, run } = DATA.landscapes[$("land-run").value];
-  const script = element("script", { src });
   $("land-said").textContent = `Loading ${decodeURIComponent(src)} ...`;
-  land.waiting = received;
-  script.addEventListener("error", () => ($("land-said").textContent = `${decodeURIComponent(src)} cannot be loaded: keep the folder of ${run} beside this page.`));
-  script.addEventListener("load", () => script.remove());
-  document.body.append(script);
+  const file = (land.file = load(src, `the folder of ${run}`));
+  try {
+    const content = await file;
+    if (land.file !== file) return;
+    land.arrived = content;
+    if (land.seen) received(content);
+  } catch (error) {
+    if (land.file === file) $("land-said").textContent = error.message;
+  }
 }
 
 function listLandscapes() {
@@ -351,7 +352,7 @@ function listLandscapes() {
   select.replaceChildren(...left.map((k) => element("option", { value: k, textContent: DATA.landscapes[k].run })));
   $("landscape").hidden = !left.length;
   if (before && left.includes(Number(before))) select.value = before;
-  else if (land.content && left.length) loadLandscape();
+  else if (left.length) loadLandscape();
 }
 
 if ($("landscape")) {
@@ -371,10 +372,8 @@ if ($("landscape")) {
   }
   for (const event of ["resize", "beforeprint", "afterprint"]) addEventListener(event, () => setTimeout(drawLandscape, 200));
   dark.addEventListener("change", () => drawLandscape());
-  const seen = new IntersectionObserver((entries) => {
-    if (land.content || !entries.some((entry) => entry.isIntersecting)) return;
-    seen.disconnect();
-    loadLandscape();
-  }, { rootMargin: "300px" });
-  seen.observe($("landscape"));
+  whenSeen($("landscape"), () => {
+    land.seen = true;
+    if (land.arrived) received(land.arrived);
+  });
 }

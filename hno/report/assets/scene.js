@@ -1,5 +1,9 @@
 /** Draws an episode at any moment into a canvas: from above, from the side, or in space. Lengths are to scale. */
-const color = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
+const known = new Map(); // until the next picture
+function color(name) {
+  if (!known.has(name)) known.set(name, getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim());
+  return known.get(name);
+}
 const category = () => theme().config.range.category;
 const mix = (a, b, share) => a.map((value, k) => value + share * (b[k] - value));
 
