@@ -60,7 +60,7 @@ async function drawStrips(episode, scene) {
   const wanted = strips(episode, scene);
   const hosts = wanted.map(([, , name]) => {
     const plot = element("div", { className: "plot" });
-    const host = element("div", { className: "strip" }, plot, element("div", { className: "now" }));
+    const host = element("div", { className: "strip" }, plot, element("canvas", { className: "now" }));
     host.setAttribute("role", "img");
     host.setAttribute("aria-label", `${name}, by player`);
     return host;
@@ -117,12 +117,11 @@ function seek(time) {
   const clock = `${player.time.toFixed(2)} s${branch === undefined ? "" : `, branch ${branch}`}`;
   const moment = { episode, beside, scene: DATA.scenes[episode.game] ?? {}, time: player.time, follow: $("follow").checked };
   known.clear();
-  for (const view of player.views) paint(view, moment); // before anything moves: it asks for the size of the canvas
+  for (const view of player.views) paint(view, moment); // before anything changes: it asks for the size of the canvas
+  for (const strip of player.strips) mark(strip, player.time);
   $("scrub").value = player.time;
   $("scrub").setAttribute("aria-valuetext", clock);
   $("clock").textContent = clock;
-  for (const { view, host } of player.strips)
-    host.lastChild.style.transform = `translateX(${view.origin()[0] + view.scale("x")(player.time) + view.padding().left}px)`;
 }
 
 function play(on) {

@@ -225,8 +225,8 @@ function seen(view, episode, beside, time, follow) {
   return follow ? extent(view, at(episode.t, episode.p, time), 2.2 * radius + 2) : extent(view, all, 0.7 * radius + 1);
 }
 
-function paint(view, { episode, beside, scene, time, follow }) {
-  const canvas = view.canvas;
+/** An empty canvas, drawn on in pixels of the page. */
+function cleared(canvas) {
   const [width, height] = [canvas.clientWidth, canvas.clientHeight];
   const ratio = devicePixelRatio || 1;
   if (canvas.width !== Math.round(width * ratio) || canvas.height !== Math.round(height * ratio))
@@ -234,6 +234,11 @@ function paint(view, { episode, beside, scene, time, follow }) {
   const ctx = canvas.getContext("2d");
   ctx.setTransform(ratio, 0, 0, ratio, 0, 0);
   ctx.clearRect(0, 0, width, height);
+  return { ctx, width, height };
+}
+
+function paint(view, { episode, beside, scene, time, follow }) {
+  const { ctx, width, height } = cleared(view.canvas);
   fit(view, seen(view, episode, beside, time, follow && view.kind !== "space"), width, height, 16);
   roads(ctx, view, scene, width, height);
   const now = at(episode.t, episode.p, time);
@@ -247,4 +252,11 @@ function paint(view, { episode, beside, scene, time, follow }) {
   players(ctx, view, episode, scene, time, false);
   changes(ctx, view, episode, time);
   ruler(ctx, view, width, height);
+}
+
+/** The moment in a chart over time. A canvas, since an element that moves costs all layers of the page. */
+function mark({ view, host }, time) {
+  const { ctx, height } = cleared(host.lastChild);
+  const x = Math.round(view.origin()[0] + view.scale("x")(time) + view.padding().left) + 0.5;
+  line(ctx, [[x, 0], [x, height]], { strokeStyle: color("ink"), dash: [3, 3] });
 }
