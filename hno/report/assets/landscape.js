@@ -5,6 +5,7 @@ const TOLERANCE = 0.01;
 const land = { content: null, evaluate: null, file: null, error: null, turn: 0, across: "", up: "", tau: 0, theta: [], at: {} };
 
 const coordinate = (name) => land.content.coordinates.find((one) => one.name === name);
+const short = (value) => Number(Number(value).toPrecision(3));
 const dot = (a, b, from = 0) => a.reduce((sum, one, k) => sum + one * b[from + k], 0);
 const apart = (one, other) => dot(one.weights, other.weights) === 0;
 
@@ -149,7 +150,7 @@ function family(n, shown) {
 function showLevels(found) {
   const select = $("land-level");
   const before = select.value;
-  const texts = found.map((level) => String(Number(level.toPrecision(3))));
+  const texts = found.map((level) => String(short(level)));
   select.replaceChildren(element("option", { value: "", textContent: "none" }), ...texts.map((text) => element("option", { value: text, textContent: text })));
   select.value = texts.includes(before) ? before : "";
   select.disabled = !land.evaluate;
@@ -179,7 +180,7 @@ function showValue(at, values, n, title) {
   });
   if (!sides.every(({ place }) => place >= 0 && place < n)) return;
   const found = values[sides[1].place * n + sides[0].place];
-  const where = sides.map(({ name, unit, value }) => `${name} ${Number(value.toPrecision(3))} ${unit}`).join(", ");
+  const where = sides.map(({ name, unit, value }) => `${name} ${short(value)} ${unit}`).join(", ");
   $("land-at").textContent = `${where}: ${title} ${Number.isFinite(found) ? Number(found.toPrecision(4)) : "n/a"}`;
 }
 
@@ -221,6 +222,8 @@ function drawLandscape(coarse = false) {
     surface("land-truth", wanted, n, scale, barrier);
     surface("land-error", off, n, { ...scaleOf(off, true), title: "difference" }, barrier);
   }
+  const run = DATA.landscapes[$("land-run").value].run;
+  $("land-what").textContent = `Learned: ${shown.title} of ${run}, θ = (${land.theta.map(short).join(", ")}), ${short(land.tau)} s to go`;
   $("land-said").textContent = said(compared, values, wanted);
   land.drawn = { n, values, shown };
 }
@@ -237,6 +240,7 @@ function drawFilm(k) {
   const title = potential ? "W" : `V${place + 1}`;
   for (const name of ["truth", "error"]) $(`land-${name}-box`).hidden = true;
   surface("land-learned", all_frames[k], film.points, { ...scaleOf([...all_frames.flat(), ...wanted], false), title, level: [] }, film.violation);
+  $("land-what").textContent = `Learned: ${title} after step ${film.frames[k].step}`;
   $("land-film-step").textContent = `step ${film.frames[k].step}`;
   $("land-said").textContent = `${title} after step ${film.frames[k].step}, frame ${k + 1} of ${film.frames.length}, from Python.`;
 }
@@ -277,7 +281,7 @@ function difference() {
 function slider(name, value, [lo, hi], unit, set) {
   const input = element("input", { type: "range", min: lo, max: hi, step: "any", value });
   const shown = element("output");
-  const show = () => (shown.textContent = `${Number(Number(input.value).toPrecision(3))} ${unit}`);
+  const show = () => (shown.textContent = `${short(input.value)} ${unit}`);
   input.addEventListener("input", () => {
     set(Number(input.value));
     show();
@@ -370,7 +374,8 @@ if ($("landscape")) {
       drawLandscape();
     });
   }
-  for (const event of ["resize", "beforeprint", "afterprint"]) addEventListener(event, () => setTimeout(drawLandscape, 200));
+  for (const event of ["resize", "afterprint"]) addEventListener(event, () => setTimeout(drawLandscape, 200));
+  addEventListener("beforeprint", () => drawLandscape());
   dark.addEventListener("change", () => drawLandscape());
   whenSeen($("landscape"), () => {
     land.seen = true;
