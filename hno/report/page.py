@@ -14,7 +14,7 @@ from markupsafe import Markup
 from hno.data.store import replace_whole
 from hno.evaluation import format as text
 from hno.evaluation.sections import plain
-from hno.report import landscapes, page_data, vega, verdicts
+from hno.report import clearances, landscapes, page_data, vega, verdicts
 from hno.report.charts import specifications
 from hno.report.parts import Beside, Keep, parts
 from hno.report.recipes import Recipe, best, headline, recipes
@@ -64,6 +64,7 @@ def render(sweep: Sweep, refresh: float | None = None, place: Path | None = None
     data = {
         "maps": {card["id"]: page_data.heat_map(card["recipe"].types) for card in cards if "run" not in card},
         "comparison": page_data.comparison(found),
+        "clearances": (near := clearances.curves(found)),
         "curves": curves,
         "runs": [{**names_of(run), "run": run.name} for run in runs],
         "parts": kept,
@@ -88,7 +89,8 @@ def render(sweep: Sweep, refresh: float | None = None, place: Path | None = None
         sweep=sweep, recipes=found, single=len(runs) == 1,
         games={game: (headline(own), own) for game, own in games.items()}, cards=cards,
         unfinished=[run for run in runs if not run.finished], filters={name: _choices(runs, name) for name in FILTERS},
-        curve_games=sorted({entry["game"] for entry in curves}), recipe_table=recipe_table(found),
+        curve_games=sorted({one["game"] for one in curves}),
+        near_games=sorted({one["game"] for one in near}), recipe_table=recipe_table(found),
         run_table=run_table(runs), labels=label_tables(runs), sections=[entry for entry in sections if entry[1]],
         common=common, differing=differing, cached=CACHED, shown=len(listed), total=total,
         landscapes=data["landscapes"], refresh=refresh, themes=vega.THEMES, font=Markup(vega.FONT),

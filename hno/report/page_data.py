@@ -77,7 +77,7 @@ def _thinned(curve: Sequence[tuple[int, float]]) -> list[tuple[int, float]]:
 
 
 def ranked(runs: Iterable[Run]) -> list[tuple[int, Episode]]:
-    """Every episode with its run's number: the worst of every run, a typical one of every run, then by what was lost."""
+    """Every episode with its run's number: the worst of every run, a typical one of each, then by what was lost."""
     ordered = []
     for k, run in enumerate(runs):
         places = {"worst": 0, "typical": 1}

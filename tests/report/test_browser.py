@@ -62,9 +62,8 @@ class Browser:
         if title:
             self.page.select_option("#episode", label=title)
         run = json.dumps(title.split(" · ")[0])
-        self.until(
-            f"document.querySelector('#clock').textContent && document.querySelector('#said').textContent.includes({run})"
-        )
+        self.until("document.querySelector('#clock').textContent !== ''")
+        self.until(f"document.querySelector('#said').textContent.includes({run})")
 
     def filter(self, **choices: str) -> None:
         for name, value in choices.items():

@@ -79,6 +79,20 @@ function drawComparison(host) {
   draw(host, "comparison", { recipes: rows.filter((row) => matches({ ...row, seed: undefined })) });
 }
 
+/** How near episodes come: a line per recipe, and a dashed one for the equilibria from the same starts. */
+function drawClearances(host) {
+  const told = DATA.clearances.filter((one) => one.game === host.dataset.of && matches(one));
+  host.closest("figure").hidden = !told.length;
+  if (!told.length) return;
+  const percent = (share) => `${Number((100 * share).toPrecision(3))} %`;
+  const rows = ({ recipe, d, unit }, shares, label) =>
+    shares.map((share, k) => ({ recipe, d: d[k], share, label, tip: `${label ? "equilibria" : recipe}\n${percent(share)} keep no more than ${d[k]} ${unit}` }));
+  const labels = [...new Map(told.map((one) => [String(one.label), one])).values()];
+  const points = [...told.flatMap((one) => rows(one, one.share, false)), ...labels.flatMap((one) => rows(one, one.label, true))];
+  const unit = told[0].unit ? ` [${told[0].unit}]` : "";
+  draw(host, "clearances", { points }, { near: `safe starts whose smallest clearance is at most d${unit}` });
+}
+
 function drawCurves(host) {
   const metric = $("metric").value;
   const told = DATA.curves.filter((curve) => curve.game === host.dataset.of && curve.metrics[metric] && matches(curve));
@@ -104,7 +118,7 @@ function meaning(metric) {
   return (known.find(([start]) => metric.startsWith(start)) ?? ["", "as logged"])[1];
 }
 
-const kinds = { heat: drawHeat, comparison: drawComparison, curves: drawCurves };
+const kinds = { heat: drawHeat, comparison: drawComparison, clearances: drawClearances, curves: drawCurves };
 const pending = new Set(all("[data-chart]"));
 const visible = new Set();
 
@@ -158,7 +172,7 @@ $("more")?.addEventListener("click", () => {
   unfolded = true;
   foldMaps();
 });
-listeners.push(foldMaps, () => redraw("comparison", "curves"));
+listeners.push(foldMaps, () => redraw("comparison", "clearances", "curves"));
 
 const metric = $("metric");
 if (metric) {
