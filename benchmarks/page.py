@@ -109,8 +109,10 @@ def accessibility(browser: Browser, address: str, axe: str) -> None:
             page.evaluate(axe)
             found: dict[str, Any] = page.evaluate("axe.run({ resultTypes: ['violations', 'incomplete'] })")
             counts = Counter(one["impact"] for one in found["violations"])
-            print(f"axe {found['testEngine']['version']}, {scheme}, {width}: {dict(counts) or 'no finding'}; "
-                f"{len(found['passes'])} rules hold, {len(found['incomplete'])} for people to judge")
+            print(
+                f"axe {found['testEngine']['version']}, {scheme}, {width}: {dict(counts) or 'no finding'}; "
+                f"{len(found['passes'])} rules hold, {len(found['incomplete'])} for people to judge"
+            )
             for one in found["violations"]:
                 print(f"  {one['impact']} {one['id']}: {one['help']}, {len(one['nodes'])} places")
                 for node in one["nodes"][:3]:

@@ -300,6 +300,23 @@ def test_the_clock_says_which_branch_is_played(context, tmp_path):
     opened.page.close()
 
 
+def test_a_print_has_what_nobody_has_looked_at(browser):
+    """Every heat map of the sweep, the encounter and the curves are drawn for a sheet before it is printed."""
+    page = browser.page
+    assert page.locator(".map svg").count() < page.locator(".map[data-level=recipe]").count()
+    page.evaluate("dispatchEvent(new Event('beforeprint'))")
+    shown = page.evaluate(
+        """() => [...document.querySelectorAll('[data-chart]')].filter((host) => host.clientWidth)
+            .map((host) => Boolean(host.querySelector('svg, canvas')))"""
+    )
+    assert all(shown)
+    assert page.locator(".map svg").count() == page.locator(".map[data-level=recipe]").count() == 18
+    assert page.locator("#top canvas").count() == 1
+    assert page.locator("#strips svg").count() > 0
+    page.evaluate("dispatchEvent(new Event('afterprint'))")
+    assert page.locator(".map:visible").count() == 12
+
+
 def test_the_keyboard_reaches_everything(browser):
     page = browser.page
     browser.meet()

@@ -112,7 +112,7 @@ function ruler(ctx, view, width, height) {
   for (let x = Math.ceil(left / step) * step; x < right; x += step) {
     const at = (x - left) * view.scale;
     line(ctx, [[at, height], [at, height - 4]], { strokeStyle: color("muted") });
-    if (at > 40 && at < width - 40) write(ctx, `${+x.toPrecision(6)}`, at, height - 7, { textAlign: "center" });
+    if (at > 40 && at < width - 56) write(ctx, `${+x.toPrecision(6)}`, at, height - 7, { textAlign: "center" });
   }
   for (let y = Math.ceil(bottom / step) * step; y < top; y += step) {
     const at = height - (y - bottom) * view.scale;
