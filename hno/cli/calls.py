@@ -15,7 +15,7 @@ from hno.cli.config import compose, for_hydra, groups
 from hno.cli.output import fresh, owned
 from hno.cli.results import Results, recorded
 from hno.cli.settings import TrainSettings
-from hno.cli.train import head, train_operator
+from hno.cli.train import head, landscape_of, train_operator
 from hno.games import Game, games
 from hno.processes import interruptible_call
 from hno.training.checkpoint import LearnedPolicy, load_policy
@@ -28,7 +28,7 @@ def train(
     folder: str | Path | None = None,
     settings: Mapping[str, Any] | None = None,
 ) -> LearnedPolicy:
-    """Solve labels and train an operator, as `hno train` does, without its evaluation.
+    """Solve labels and train an operator, as `hno train` does, without its evaluation; its landscape is in the folder.
 
     Args:
         game: a registered name, or a game of a registered class.
@@ -52,8 +52,9 @@ def train(
     with owned(place, checked.resume):
         results = Results(place / "results.json", head(checked))
         with recorded(results):
-            fitted = train_operator(checked, place, results)
-    return load_policy(fitted.checkpoint)
+            policy = load_policy(train_operator(checked, place, results).checkpoint)
+            results.update(**landscape_of(policy, checked, results))
+    return policy
 
 
 @interruptible_call()
@@ -75,7 +76,8 @@ def evaluate(
         CheckpointError: a checkpoint that cannot be read.
         KeyboardInterrupt, SystemExit: a signal ended it.
     """
-    chosen = _overrides("evaluate", {"checkpoint": str(checkpoint), **(settings or {})})
+    drawn = {"landscape": folder is not None}  # without a folder there is no page that shows it
+    chosen = _overrides("evaluate", {"checkpoint": str(checkpoint), **drawn, **(settings or {})})
     checked = evaluation.check(compose("evaluate", for_hydra("evaluate", Arguments([], chosen, {}))))
     with tempfile.TemporaryDirectory() as nowhere:
         place = Path(nowhere if folder is None else folder)

@@ -17,8 +17,8 @@ from hno.cli import launch
 from hno.cli.arguments import Arguments
 from hno.cli.config import read
 from hno.cli.landscapes import write_landscape
-from hno.cli.logs import use_threads
-from hno.cli.media import draw_typical
+from hno.cli.logs import loggers, use_threads
+from hno.cli.media import draw_typical, publish
 from hno.cli.progress import label_progress, progress
 from hno.cli.results import Results, write_json
 from hno.cli.sections import chosen_sections, run_sections
@@ -139,6 +139,7 @@ def describe(
 def evaluate(settings: EvaluateSettings, results: Results) -> None:
     """Evaluate models; every part is written into the results as it is done."""
     use_threads(settings.threads)
+    makers = loggers(settings, results.path.parent)
     policies, evaluations = prepared(settings)
     models: list[dict[str, Any]] = [
         {"checkpoint": evaluation.name, **policy.names(), "seed": policy.origin()["seed"]}
@@ -158,6 +159,8 @@ def evaluate(settings: EvaluateSettings, results: Results) -> None:
         results.update(**models[0])
     if len(models) > 1:
         results.update(models=models, comparison=PairedComparison().compute(played))
+    if makers:
+        publish(makers, results.content, results.path.parent, 0)
 
 
 def types_to_evaluate(choice: Any, policy: Model, unseen: Any = None) -> list[Types]:

@@ -21,7 +21,7 @@ import hno
 from hno.cli import pages
 from hno.cli.arguments import Arguments, UsageError, one_screen, quoted
 from hno.cli.config import REFUSALS, configured, for_hydra, groups, register_plugins, sentence, under_hydra
-from hno.cli.logs import finish_wandb
+from hno.cli.logs import finish_wandb, refuse_wandb
 from hno.cli.objective import Objective, objective
 from hno.cli.output import fresh, owned
 from hno.cli.progress import collect_messages
@@ -191,7 +191,7 @@ def _job(task: Task, config: DictConfig, ledger: Ledger, own: Parts, dry: bool) 
     try:
         settings = task.check(config)
     except Exception as error:
-        print(f"   refused: {one_screen(sentence(error))}") if dry else _refuse(current, error)
+        print(f"   refused: {one_screen(sentence(error))}") if dry else _refuse(task, config, current, error)
         return None
     found = None if dry else _performed(task, settings, current, ledger)
     ledger.write(Entry(current, dry or found is not None))
@@ -210,12 +210,14 @@ def _performed(task: Task, settings: Any, job: Job, ledger: Ledger) -> Results |
     return None
 
 
-def _refuse(job: Job, error: Exception) -> None:
+def _refuse(task: Task, config: DictConfig, job: Job, error: Exception) -> None:
     """Leave the reason in the results of a job that is not run: it is no failure of the jobs after it."""
     chosen = HydraConfig.get().runtime.choices
     results = Results(job.folder / "results.json", {group: chosen.get(group) for group in NAMES})
     results.update(status="failed", reason=sentence(error))
     log.error("%s", one_screen(sentence(error)))
+    content: Any = OmegaConf.to_container(config, resolve=False)
+    refuse_wandb(content, results.content, job.folder, task.name)
 
 
 def perform(task: Task, settings: Any, folder: Path) -> Results | None:

@@ -20,7 +20,8 @@ from lightning.pytorch.loggers import Logger, TensorBoardLogger, WandbLogger
 
 from hno.cli import pages
 from hno.cli.curve import CurveLogger
-from hno.cli.settings import TrainSettings
+from hno.cli.schema import validated
+from hno.cli.settings import EvaluateSettings, LoggerSettings, TrainSettings
 from hno.report.runs import METRICS, RESULTS
 
 log = logging.getLogger(__name__)
@@ -34,7 +35,7 @@ def use_threads(count: int | None) -> None:
         torch.set_num_threads(count)
 
 
-def loggers(settings: TrainSettings, folder: Path, first: int = 0) -> list[Logger]:
+def loggers(settings: TrainSettings | EvaluateSettings, folder: Path, first: int = 0) -> list[Logger]:
     """The chosen loggers, each once; they keep what they have of steps before the first one.
 
     Raises:
@@ -42,7 +43,10 @@ def loggers(settings: TrainSettings, folder: Path, first: int = 0) -> list[Logge
         ValueError: W&B cannot run as asked for.
     """
     made: list[Logger] = []
-    for name in dict.fromkeys(settings.logger.names):
+    chosen = settings.logger
+    if chosen is None:
+        return made
+    for name in dict.fromkeys(chosen.names):
         if name == "csv":
             made.append(CurveLogger(folder / METRICS, first))
         elif name == "tensorboard":
@@ -53,21 +57,30 @@ def loggers(settings: TrainSettings, folder: Path, first: int = 0) -> list[Logge
                 raise RuntimeError(message) from error
         elif importlib.util.find_spec("wandb") is None:
             log.info("W&B is not installed: metrics go to %s alone. `pip install wandb` adds it.", METRICS)
-        elif (mode := wandb_mode(settings.logger.mode)) != "disabled":
-            made.append(_wandb(settings, folder, mode))
+        elif (mode := wandb_mode(chosen.mode)) != "disabled":
+            kind = "train" if isinstance(settings, TrainSettings) else "evaluate"
+            made.append(_wandb(chosen, folder, mode, settings.model_dump(), kind))
         else:
             log.info("W&B is switched off: metrics go to %s alone.", METRICS)
-    return made or [CurveLogger(folder / METRICS, first)] * bool(settings.logger.names)
+    return made or [CurveLogger(folder / METRICS, first)] * bool(chosen.names)
 
 
-def _wandb(settings: TrainSettings, folder: Path, mode: str) -> Logger:
-    """The run of the folder, if W&B left one there: it ends the names of its own folders with the run's id."""
+def _wandb(chosen: LoggerSettings, folder: Path, mode: str, config: Mapping[str, Any], kind: str) -> Logger:
+    """The run of the folder, if W&B left one there: it ends the names of its own folders with the run's id.
+
+    Args:
+        chosen: project and mode.
+        folder: of the run.
+        mode: what the mode comes to.
+        config: all settings, with tags and notes.
+        kind: the job type, the command's name.
+    """
     os.environ.setdefault("WANDB_SILENT", "true")  # what it says is in its files, and here where those are
     known = sorted(folder.glob("wandb/*run-*-*"))
     logger = WandbLogger(
-        name=folder.name, save_dir=folder, mode=mode, project=settings.logger.project, group=folder.parent.name,
-        config=settings.model_dump(), id=known[-1].name.rpartition("-")[2] if known else None, resume="allow",
-        job_type="train", tags=settings.tags or None, notes=settings.notes,
+        name=folder.name, save_dir=folder, mode=mode, project=chosen.project, group=folder.parent.name,
+        config=dict(config), id=known[-1].name.rpartition("-")[2] if known else None, resume="allow",
+        job_type=kind, tags=config.get("tags") or None, notes=config.get("notes"),
     )  # fmt: skip
     run = logger.experiment
     here = shlex.quote(str(Path(run.dir).parent))
@@ -79,6 +92,27 @@ def rates(made: Sequence[Logger], chosen: Sequence[Callback]) -> list[Callback]:
     """What tells W&B the learning rate at every step that it is told the losses of, unless it is chosen anyway."""
     there = any(isinstance(one, LearningRateMonitor) for one in chosen)
     return [LearningRateMonitor("step")] if not there and any(isinstance(one, WandbLogger) for one in made) else []
+
+
+def refuse_wandb(config: Mapping[str, Any], results: Mapping[str, Any], folder: Path, kind: str) -> None:
+    """Make a refused job a W&B run with the reason in its summary, where its configuration asks for W&B.
+
+    Args:
+        config: as composed; what is refused in it may be anything but the logger.
+        results: content of results.json.
+        folder: where it lies.
+        kind: the job type, the command's name.
+    """
+    try:
+        chosen = validated(LoggerSettings, config.get("logger") or {"names": [], "project": "none", "mode": "auto"})
+        if "wandb" not in chosen.names or importlib.util.find_spec("wandb") is None:
+            return
+        check_wandb()
+        if (mode := wandb_mode(chosen.mode)) != "disabled":
+            _wandb(chosen, folder, mode, config, kind)
+            finish_wandb(results, folder)
+    except Exception as error:  # the job has its reason; this is about where else it is told
+        log.warning("The refused job is no run of W&B: %s", error)
 
 
 def finish_wandb(results: Mapping[str, Any], folder: Path) -> None:
@@ -104,10 +138,14 @@ def finish_wandb(results: Mapping[str, Any], folder: Path) -> None:
 
 def _artifact(wandb: Any, results: Mapping[str, Any], folder: Path) -> Any:
     made = wandb.Artifact(f"run-{wandb.run.id}", "run")
-    names = [pages.PAGE, RESULTS, *(results.get(key) for key in ("checkpoint", "episodes", "paths", "outcomes"))]
-    for name in names:
+    models = results.get("models", [results])
+    kept = [model.get(key) for model in models for key in ("checkpoint", "episodes", "paths", "outcomes", "landscape")]
+    beside = sorted(folder.glob(f"{Path(pages.PAGE).stem}_files/*.js"))
+    for name in dict.fromkeys([pages.PAGE, RESULTS, *kept]):
         if name is not None and (folder / name).is_file():
             made.add_file(str(folder / name))
+    for path in beside:
+        made.add_file(str(path), str(path.relative_to(folder)))
     return made
 
 

@@ -58,6 +58,7 @@ def numbers(results: Mapping[str, Any]) -> dict[str, float]:
         "best/collision_rate": validation.get("collision_rate"),
         "best/excess_cost": validation.get("excess"),
         **{f"collision_rate/{name_of(row['theta'])}": row["rate"] for row in results["table"]},
+        **{f"robustness/{row['name']}": row["rate"] for row in results.get("robustness") or ()},
         **{f"seconds/{part}": seconds for part, seconds in results["seconds"].items()},
     }
     return {name: float(value) for name, value in found.items() if value is not None}

@@ -201,7 +201,10 @@ class EvaluateSettings(Episodes):
     cache: Place | None
     workers: Size | None
     threads: Size | None
+    logger: LoggerSettings | None = None
     objective: Objective = "test/collision_rate"
+    tags: list[Text] = Field(default_factory=list)
+    notes: str | None = None
 
 
 class LabelSettings(Settings):

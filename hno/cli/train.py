@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from hno.cli import launch, pages
 from hno.cli.arguments import Arguments
 from hno.cli.build import build, check, chosen_callbacks, how_to_train, record_of
 from hno.cli.config import configured
-from hno.cli.evaluate import describe, play_starts, unseen_types
+from hno.cli.evaluate import Types, describe, play_starts, unseen_types
 from hno.cli.film import Film
 from hno.cli.landscapes import write_landscape
 from hno.cli.logs import loggers, rates, use_threads
@@ -25,8 +26,9 @@ from hno.cli.settings import TrainSettings
 from hno.data.certificates import safe_sets, summaries
 from hno.data.datamodule import GameData
 from hno.data.labels import Request, default_cache, safe_labels_for
+from hno.evaluation.sections import Evaluation
 from hno.games.grid import parse_types
-from hno.training.checkpoint import load_policy
+from hno.training.checkpoint import LearnedPolicy, load_policy
 from hno.training.divergence import DivergedError
 from hno.training.fit import Fitted, fit
 from hno.training.saving import BEST
@@ -70,15 +72,25 @@ def train(settings: TrainSettings, results: Results) -> None:
     """One run; its folder gets best.ckpt, last.ckpt, metrics and results.json."""
     folder = results.path.parent
     fitted = train_operator(settings, folder, results)
-    policy, chosen = load_policy(fitted.checkpoint), settings.evaluation
-    types = [*policy.types, *unseen_types(policy.game, chosen.types, "evaluation.types")]
-    models = [(str(results.content["checkpoint"]), policy)]
-    (evaluation,) = describe(models, types, chosen.model_dump(), settings.data.cache, settings.data.workers)
-    played, _ = play_starts(evaluation, results)
+    policy = load_policy(fitted.checkpoint)
+    types = [*policy.types, *unseen_types(policy.game, settings.evaluation.types, "evaluation.types")]
+    played, _ = play_starts(described(policy, types, settings, results), results)
     for name, content in run_sections(played, results):
         results.update(**{name: content})
     results.update(**write_landscape(played, results))
     publish(fitted.trainer.loggers, results.content, folder, fitted.trainer.global_step)
+
+
+def described(policy: LearnedPolicy, types: Sequence[Types], settings: TrainSettings, results: Results) -> Evaluation:
+    """The evaluation of what was trained, before anything is solved."""
+    models, options = [(str(results.content["checkpoint"]), policy)], settings.evaluation.model_dump()
+    (found,) = describe(models, types, options, settings.data.cache, settings.data.workers)
+    return found
+
+
+def landscape_of(policy: LearnedPolicy, settings: TrainSettings, results: Results) -> dict[str, str]:
+    """Write the landscape of what was trained without an evaluation, see `write_landscape`."""
+    return write_landscape(described(policy, policy.types, settings, results), results)
 
 
 def train_operator(settings: TrainSettings, folder: Path, results: Results) -> Fitted:

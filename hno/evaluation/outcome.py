@@ -73,6 +73,8 @@ class Played(NamedTuple):
     """Minus the cost of each player, shape (B, P)."""
     distance: Tensor
     """Smallest distance between players, m, shape (B,)."""
+    clearance: Tensor
+    """Smallest value of -constraint, shape (B,)."""
     collided: Tensor
     """Whether they collide, shape (B,)."""
     lost: Tensor
@@ -90,6 +92,7 @@ def numbers_of(game: Game, label: Extremal, paths: Trajectory) -> Played:
         label._replace(t=label.t[:1], value=label.value[:, :1].clone(), **none),
         paths.value,
         paths.distance,
+        paths.clearance,
         paths.collided,
         paths.lost,
         saturated_share(paths.u, game.control_box),

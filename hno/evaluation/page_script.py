@@ -12,9 +12,9 @@ LANDSCAPE = "landscape{}.js"
 CALL, END = "hnoLandscape(", ");\n"
 
 
-def script(content: Mapping[str, Any]) -> str:
-    """The file of a landscape."""
-    return f"{CALL}{json.dumps(content, separators=(',', ':'), allow_nan=False)}{END}"
+def script(content: Mapping[str, Any], call: str = CALL) -> str:
+    """A file that hands content over: one call, of a landscape's function unless another one is named."""
+    return f"{call}{json.dumps(content, separators=(',', ':'), allow_nan=False)}{END}"
 
 
 def check_script(path: Path) -> None:

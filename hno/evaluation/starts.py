@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -26,6 +27,10 @@ class Starts(NamedTuple):
     """One digit per start: 1 where it counts, since its equilibrium keeps the clearance."""
     collided: str
     """One digit per start: 1 where the episode collides."""
+    clearance: tuple[float | None, ...] = ()
+    """Smallest clearance of every episode, in the constraint's unit; None where it is lost; empty if none was kept."""
+    label_clearance: tuple[float | None, ...] = ()
+    """The same of the equilibrium."""
 
 
 def key_of(x0: Tensor) -> str:
@@ -38,7 +43,7 @@ def starts_of(evaluation: Evaluation) -> list[dict[str, Any]]:
     return [
         Starts(
             tuple(found.theta[0].tolist()), key_of(found.x[:, 0]), _digits(safe(found, evaluation.clearance)),
-            _digits(played.collided),
+            _digits(played.collided), _numbers(played.clearance), _numbers(found.clearance),
         )._asdict()
         for found, played in zip(evaluation.labels, evaluation.played, strict=True)
     ]  # fmt: skip
@@ -51,9 +56,13 @@ def starts_from(content: Any) -> Starts:
         ValueError: it is none.
     """
     try:
-        found = Starts(tuple(map(float, content["theta"])), *(str(content[name]) for name in Starts._fields[1:]))
-    except (LookupError, TypeError) as error:
+        key, counted, collided = (str(content[name]) for name in ("key", "counted", "collided"))
+        near = (tuple(map(_number, content.get(name, ()))) for name in ("clearance", "label_clearance"))
+        found = Starts(tuple(map(float, content["theta"])), key, counted, collided, *near)
+    except (LookupError, TypeError, AttributeError) as error:
         raise ValueError(f"expected {', '.join(Starts._fields)}; got {content!r:.60}") from error
+    if {len(found.clearance), len(found.label_clearance)} - {0, len(found.counted)}:
+        raise ValueError(f"clearances must be one per start; got {content!r:.60}")
     if len(found.counted) != len(found.collided) or set(found.counted + found.collided) - {"0", "1"}:
         raise ValueError(f"counted and collided must be digits 0 and 1, one per start; got {content!r:.60}")
     return found
@@ -100,6 +109,15 @@ def holm(p_values: Sequence[float]) -> list[float]:
         largest = max(largest, min(1.0, (len(p_values) - place) * p_values[k]))
         adjusted[k] = largest
     return [adjusted[k] for k in range(len(p_values))]
+
+
+def _number(value: Any) -> float | None:
+    return None if value is None else float(value)
+
+
+def _numbers(values: Tensor) -> tuple[float | None, ...]:
+    """With four significant digits, which keep the sign."""
+    return tuple(float(f"{one:.4g}") if math.isfinite(one) else None for one in values.double().tolist())
 
 
 def _digits(flags: Tensor) -> str:

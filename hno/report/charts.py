@@ -85,6 +85,29 @@ def comparison(data: Any) -> Layers:
     )
 
 
+def clearances(data: Any) -> Layers:
+    """Share of safe starts that keep no more than d, from rows with d, share, recipe and whether it is a "label".
+
+    Its signal "near" is the name above the vertical axis.
+    """
+    scale = alt.Scale(type="symlog", constant=LEAST / 4, domain=[0, 1], nice=False)
+    axis = alt.Axis(values=[0, 0.001, 0.01, 0.1, 1], labelExpr="100 * datum.value + ' %'")
+    base = alt.Chart(data).encode(
+        x=alt.X("d:Q", title="d", axis=alt.Axis(grid=False, tickCount=6), scale=alt.Scale(nice=False)),
+        y=alt.Y("share:Q", title=None, scale=scale, axis=axis),
+    )
+    line = alt.Chart(data).mark_rule(color=alt.expr("danger"), strokeWidth=1.2).encode(x=alt.XDatum(0))
+    name = alt.Color("recipe:N", sort=None, legend=alt.Legend(title=None, orient="bottom", columns=2, labelLimit=260))
+    lines = base.mark_line(strokeWidth=1.6).encode(color=name).transform_filter("!datum.label")
+    dashed = base.mark_line(strokeWidth=1.4, strokeDash=[5, 4], color=alt.expr("muted")).encode(detail="recipe:N")
+    tips = base.mark_circle(size=50, opacity=0).encode(tooltip="tip:N")
+    return (
+        alt.layer(line, dashed.transform_filter("datum.label"), lines, tips)
+        .properties(width="container", height=180, title=heading("near"))
+        .add_params(*colors(), alt.param(name="near", value=""))
+    )
+
+
 def learning_curves(data: Any, scale: Literal["log", "linear"]) -> Layers:
     """A metric over training steps, one line for every run, from rows with step, value, run and recipe.
 
@@ -180,6 +203,7 @@ def specifications() -> dict[str, Any]:
     cells, rows, points, frames = (alt.NamedData(name) for name in ("cells", "recipes", "points", "frames"))
     charts = {
         "heat": heat_map(cells), "comparison": comparison(rows), "log": learning_curves(points, "log"),
+        "clearances": clearances(points),
         "linear": learning_curves(points, "linear"), "separation": separation(frames),
         "beliefs": beliefs(frames), "strip": strip(alt.NamedData("series")),
     }  # fmt: skip

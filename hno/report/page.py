@@ -1,4 +1,4 @@
-"""One self-contained HTML file about a sweep: no network, no other file."""
+"""One HTML file about a sweep, which asks no network; what it shows of single runs of several lies beside it."""
 
 from __future__ import annotations
 
@@ -14,8 +14,9 @@ from markupsafe import Markup
 from hno.data.store import replace_whole
 from hno.evaluation import format as text
 from hno.evaluation.sections import plain
-from hno.report import landscapes, page_data, vega, verdicts
+from hno.report import clearances, landscapes, page_data, vega, verdicts
 from hno.report.charts import specifications
+from hno.report.parts import Beside, Keep, parts
 from hno.report.recipes import Recipe, best, headline, recipes
 from hno.report.records import Run
 from hno.report.runs import Sweep
@@ -29,30 +30,45 @@ from hno.report.tables import (
     recipe_table,
     run_table,
     section_tables,
-    type_table,
 )
 from hno.report.validity import validity
 
-EPISODES = 400
-"""Episodes of a page, at most."""
-
 
 def write_page(sweep: Sweep, path: Path, refresh: float | None = None) -> None:
-    """Write the page, whole or not at all; `refresh` is in how many seconds an open page loads itself again."""
-    page = render(sweep, refresh, path.parent)
+    """Write the page, whole or not at all, and what it loads of several runs; of one run all is in the page.
+
+    Args:
+        sweep: what it is about.
+        path: where it lies; scripts are in the folder `<its name>_files` beside it.
+        refresh: in how many seconds an open page loads itself again.
+    """
+    beside = Beside(path)
+    page = render(sweep, refresh, path.parent, beside.keep if len(sweep.runs) > 1 else None)
     replace_whole(path, lambda draft: draft.write_text(page, encoding="utf-8"))
+    beside.tidy()
 
 
-def render(sweep: Sweep, refresh: float | None = None, place: Path | None = None) -> str:
-    """The page as text; `place` is the folder that it will lie in."""
+def render(sweep: Sweep, refresh: float | None = None, place: Path | None = None, keep: Keep | None = None) -> str:
+    """The page as text.
+
+    Args:
+        sweep: what it is about.
+        refresh: see `write_page`.
+        place: the folder that it will lie in.
+        keep: keeps what belongs to a single run elsewhere and returns the address; without it, all is in the page.
+    """
     runs, found = sweep.runs, recipes(sweep.runs)
-    cards, played, chosen = _cards(found), page_data.ranked(runs), best(found)
+    cards, chosen = _cards(found, runs), best(found)
     curves = page_data.learning_curves(found, runs)
+    listed, kept, total = parts(runs, keep or (lambda part: part))
     data = {
-        "maps": {card["id"]: page_data.cells(card["recipe"].types) for card in cards},
+        "maps": {card["id"]: page_data.heat_map(card["recipe"].types) for card in cards if "run" not in card},
         "comparison": page_data.comparison(found),
+        "clearances": (near := clearances.curves(found)),
         "curves": curves,
-        "episodes": [page_data.playable(run, one) for run, one in played[:EPISODES]],
+        "runs": [{**names_of(run), "run": run.name} for run in runs],
+        "parts": kept,
+        "episodes": listed,
         "scenes": page_data.scenes(runs),
         "members": {card["id"]: [run.name for run in card["recipe"].runs] for card in cards},
         "landscapes": landscapes.entries(runs, place),
@@ -67,15 +83,16 @@ def render(sweep: Sweep, refresh: float | None = None, place: Path | None = None
         loader=jinja2.PackageLoader("hno.report", "assets"), autoescape=True, undefined=jinja2.StrictUndefined,
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
-    environment.globals |= {"format": text, "verdicts": verdicts, "names_of": names_of, "type_table": type_table}
+    environment.globals |= {"format": text, "verdicts": verdicts, "names_of": names_of}
     environment.globals["validity"] = validity
     return environment.get_template("page.html.j2").render(
         sweep=sweep, recipes=found, single=len(runs) == 1,
         games={game: (headline(own), own) for game, own in games.items()}, cards=cards,
         unfinished=[run for run in runs if not run.finished], filters={name: _choices(runs, name) for name in FILTERS},
-        curve_games=sorted({entry["game"] for entry in curves}), recipe_table=recipe_table(found),
+        curve_games=sorted({one["game"] for one in curves}),
+        near_games=sorted({one["game"] for one in near}), recipe_table=recipe_table(found),
         run_table=run_table(runs), labels=label_tables(runs), sections=[entry for entry in sections if entry[1]],
-        common=common, differing=differing, cached=CACHED, shown=min(len(played), EPISODES), total=len(played),
+        common=common, differing=differing, cached=CACHED, shown=len(listed), total=total,
         landscapes=data["landscapes"], refresh=refresh, themes=vega.THEMES, font=Markup(vega.FONT),
         vega=Markup(vega.library().replace("</script", "<\\/script").replace("<!--", "<\\!--")), data=embedded(data),
     )  # fmt: skip
@@ -86,12 +103,17 @@ def embedded(content: Any) -> Markup:
     return htmlsafe_json_dumps(content, separators=(",", ":"), sort_keys=True, allow_nan=False)
 
 
-def _cards(found: Sequence[Recipe]) -> list[dict[str, Any]]:
+def _cards(found: Sequence[Recipe], runs: Sequence[Run]) -> list[dict[str, Any]]:
     """Heat maps of recipes, safest first, then of their single runs."""
     ordered = sorted((one for one in found if one.types), key=lambda one: (one.game, one.pooled.rate or 0.0))
     pooled = [{"recipe": one, "names": names_of(one) | {"level": "recipe"}, "runs": one.seeds} for one in ordered]
+    places = {id(run): k for k, run in enumerate(runs)}
     single = [
-        {"recipe": dataclasses.replace(one, runs=(run,)), "names": names_of(run) | {"level": "run"}}
+        {
+            "recipe": dataclasses.replace(one, runs=(run,)),
+            "names": names_of(run) | {"level": "run"},
+            "run": places[id(run)],
+        }
         | {"runs": f"seed {plain(run.seed)}"}
         for one in ordered
         for run in one.runs

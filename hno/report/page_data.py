@@ -10,16 +10,23 @@ from hno.evaluation.format import at, interval, number, percent, signed
 from hno.report.episode import Episode, closest, columns
 from hno.report.recipes import Recipe
 from hno.report.records import Run
-from hno.report.tables import Row, names_of
+from hno.report.tables import Row, names_of, type_table
 from hno.report.verdicts import clearance, share
 
 POINTS = 120
 """Points of a learning curve, at most."""
+DIGITS = 5
+"""Significant digits of its values."""
+CELL = "theta", "seen", "safe_starts", "rate", "interval"
+"""What a heat map shows of a type."""
 
 
-def cells(types: Iterable[Row]) -> list[Row]:
-    """Rows of `recipes.by_type` with texts for a heat map."""
-    return [{**one, "tip": _tip(one)} for one in types]
+def heat_map(types: Sequence[Row]) -> Row:
+    """Cells of a heat map and the table of its numbers, from rows of `recipes.by_type`."""
+    table = type_table(types)
+    rows = [table.cells(row) for row in table.rows]
+    cells = [{**{name: one[name] for name in CELL}, "tip": _tip(one)} for one in types]
+    return {"cells": cells, "columns": [column.title for column in table.columns], "rows": rows}
 
 
 def _tip(one: Row) -> str:
@@ -66,17 +73,23 @@ def learning_curves(recipes: Iterable[Recipe], runs: Iterable[Run]) -> list[Row]
 
 def _thinned(curve: Sequence[tuple[int, float]]) -> list[tuple[int, float]]:
     kept = np.linspace(0, len(curve) - 1, min(POINTS, len(curve))).round().astype(int)
-    return [curve[k] for k in kept]
+    return [(curve[k][0], float(f"{curve[k][1]:.{DIGITS}g}")) for k in kept]
 
 
-def ranked(runs: Iterable[Run]) -> list[tuple[Run, Episode]]:
-    """Every episode: the worst of every run first, then a typical one of every run, then by what was lost."""
+def ranked(runs: Iterable[Run]) -> list[tuple[int, Episode]]:
+    """Every episode with its run's number: the worst of every run, a typical one of each, then by what was lost."""
     ordered = []
-    for run in runs:
+    for k, run in enumerate(runs):
         places = {"worst": 0, "typical": 1}
         own = sorted(run.episodes, key=lambda one: one.order)
-        ordered += [(places.pop(one.kind, 2), one.order, run, one) for one in own]
-    return [(run, one) for *_, run, one in sorted(ordered, key=lambda entry: entry[:2])]
+        ordered += [(places.pop(one.kind, 2), one.order, k, one) for one in own]
+    return [(k, one) for *_, k, one in sorted(ordered, key=lambda entry: entry[:2])]
+
+
+def entry(found: Episode) -> Row:
+    """What the page lists of an episode."""
+    flags = {name: True for name in ("collided", "other_side") if getattr(found, name)}
+    return {"theta": list(found.theta), "kind": found.kind, "start": found.start, **flags}
 
 
 def scenes(runs: Iterable[Run]) -> dict[str, Row]:
@@ -91,14 +104,11 @@ def scenes(runs: Iterable[Run]) -> dict[str, Row]:
 
 def playable(run: Run, found: Episode) -> Row:
     """What the page's player gets of an episode."""
-    title = f"{run.name} · {at(found.theta)} · {found.kind}{' · collision' if found.collided else ''}"
-    title += " · other side" * found.other_side
-    near = clearance(found, run.constraint_unit)
-    said = f"{run.name}, types {at(found.theta)}, {found.kind}: {near}. {_costs(found)}"
+    said = (
+        f"{run.name}, types {at(found.theta)}, {found.kind}: {clearance(found, run.constraint_unit)}. {_costs(found)}"
+    )
     said += " Passes on the other side than the equilibrium." * found.other_side
-    return {**names_of(run), **columns(found), "title": title, "said": said, "collided": found.collided,
-            "closest": closest(found), "run": run.name, "kind": found.kind, "start": found.start,
-            "theta": list(found.theta)}  # fmt: skip
+    return {**columns(found), "said": said, "closest": closest(found)}
 
 
 def _costs(found: Episode) -> str:

@@ -120,10 +120,12 @@ def run_table(runs: Sequence[Run]) -> Table:
     return Table(RUN, rows)
 
 
-def type_table(found: Sequence[dict[str, Any]]) -> Table:
+def type_table(found: Sequence[Row]) -> Table:
     """Numbers of a heat map, from rows of `recipes.by_type`."""
     words = {True: "seen", False: "unseen"}
-    return Table(TYPE, [one | {"labels": words[one["seen"]] + ", extrapolated" * one["extrapolated"]} for one in found])
+    return Table(
+        TYPE, [{**one, "labels": words[one["seen"]] + ", extrapolated" * one["extrapolated"]} for one in found]
+    )
 
 
 class SectionTable(NamedTuple):

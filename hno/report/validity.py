@@ -9,6 +9,7 @@ from typing import Any
 
 from hno.evaluation.format import interval, percent
 from hno.evaluation.metrics import clopper_pearson
+from hno.report import clearances
 from hno.report.records import Run
 
 
@@ -16,7 +17,8 @@ def validity(runs: Sequence[Run]) -> str:
     """Sentences about the runs of one recipe, of which there is at least one.
 
     Where starts come from and which of them count; the rate from wider start boxes, if an evaluation has it
-    (`robustness`, conditions of a width alone); errors of the value by region, if one has them (`off_labels`).
+    (`robustness`, conditions of a width alone), and by the clearance of the equilibrium, if it was kept; errors of the
+    value by region, if one has them (`off_labels`).
     """
     first = runs[0]
     box = "the start box" if first.widen == 1 else f"a start box {first.widen:g} times as wide as the game's"
@@ -25,6 +27,7 @@ def validity(runs: Sequence[Run]) -> str:
         collisions, starts = (sum(column) for column in list(zip(*pairs, strict=True))[1:])
         between = interval(clopper_pearson(collisions, starts))
         said.append(f"{widen:g} times as wide: {percent(collisions / starts)} of {starts:,} ({between}).")
+    said += clearances.said(runs)
     regions = [f"{region} {percent(error, 0)}" for region, error in _errors(runs)]
     if regions:
         said.append(f"Value error relative to its size: {', '.join(regions)}.")

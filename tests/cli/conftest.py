@@ -77,11 +77,12 @@ def command(
     clean_globals: None,
     no_pages: None,
 ) -> Command:
-    """Run a command in this process, as the command line would, but without pictures and pages.
+    """Run a command in this process, as the command line would, but without pictures, landscapes and pages.
 
     It gets a folder of its own, but for a run that is resumed: the one before.
     """
     monkeypatch.setattr(evaluate, "draw_typical", lambda *arguments: None)
+    monkeypatch.setattr(evaluate, "write_landscape", lambda *arguments: {})  # seconds, for the page alone
 
     folders = [tmp_path / "run"]
 

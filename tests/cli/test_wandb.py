@@ -83,6 +83,34 @@ def test_a_failed_run_is_finished_too(command: Command) -> None:
     assert run.results["status"] == "failed"
 
 
+def test_an_evaluation_is_a_run_of_its_own_kind(command: Command, random_checkpoint: Path) -> None:
+    """With numbers, the table and its files, but no learning curve."""
+    words = "theta=1,1", "unseen=[]", "starts=2", "dt=0.25", "residuals=false", "tags=[a,b]", "notes=why"
+    run = command("evaluate", f"checkpoint={random_checkpoint}", *words, "logger=wandb", "workers=1")
+    assert run.code == 0, run.text
+    kept = offline_run(run.folder)
+    assert (kept.job, kept.tags, kept.notes, kept.exit_code) == ("evaluate", ["a", "b"], "why", 0)
+    assert kept.config["checkpoint"] == [str(random_checkpoint)]
+    expected = {**numbers(run.results), "status": "finished", "reason": None}
+    assert {name: kept.summary[name] for name in expected} == expected
+    assert not any("loss" in name for row in kept.history for name in row)
+    assert {"results.json", random_checkpoint.name, "episodes.json", "outcomes.json"} <= kept.files
+
+
+@pytest.mark.usefixtures("no_labels")
+def test_a_refused_job_of_a_sweep_is_a_run_that_says_why(tmp_path: Path, command: Command) -> None:
+    sweep = f"hydra.sweep.dir={tmp_path}"
+    done = command("train", "-m", "experiment=smoke", "logger=wandb,csv", "evaluation.dt=-1", sweep, folder="none")
+    assert done.code == 1, done.text
+    first, second = sorted(path.parent for path in tmp_path.glob("*/results.json"))
+    kept = offline_run(first)
+    assert (kept.job, kept.exit_code, kept.summary["status"]) == ("train", 1, "failed")
+    assert "evaluation.dt must be greater than 0" in kept.summary["reason"]
+    assert "results.json" in kept.files
+    assert wandb.run is None
+    assert not (second / "wandb").exists()
+
+
 def test_disabled_wandb_leaves_nothing(command: Command) -> None:
     run = command("train", *SMOKE, "logger=wandb", "logger.mode=disabled", "trainer.max_steps=1")
     assert run.code == 0, run.text

@@ -40,6 +40,11 @@ class OfflineRun(NamedTuple):
     summary: dict[str, Any]
     history: list[dict[str, Any]]
     exit_code: int | None
+    job: str
+    tags: list[str]
+    notes: str
+    files: set[str]
+    """Of its artifacts."""
 
 
 def written(path: Path, seconds: float = 20.0) -> list[Record]:
@@ -81,4 +86,8 @@ def offline_run(folder: Path) -> OfflineRun:
         summary,
         history,
         codes[-1] if codes else None,
+        run.job_type,
+        list(run.tags),
+        run.notes,
+        {entry.path for record in found if record.HasField("artifact") for entry in record.artifact.manifest.contents},
     )

@@ -8,6 +8,7 @@ import shutil
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from urllib.parse import unquote, urlparse
 
 import numpy as np
 import pytest
@@ -55,6 +56,15 @@ class Browser:
             assert time.monotonic() < deadline, f"never: {expression}"
             time.sleep(0.02)
 
+    def meet(self, title: str = "") -> None:
+        """Look at the player, or at one of its episodes, until it is drawn."""
+        self.page.locator("#player").scroll_into_view_if_needed()
+        if title:
+            self.page.select_option("#episode", label=title)
+        run = json.dumps(title.split(" · ")[0])
+        self.until("document.querySelector('#clock').textContent !== ''")
+        self.until(f"document.querySelector('#said').textContent.includes({run})")
+
     def filter(self, **choices: str) -> None:
         for name, value in choices.items():
             self.page.select_option(f"#filters select[name={name}]", value)
@@ -84,9 +94,8 @@ def browser(context, address) -> Iterator[Browser]:
     yield opened
     assert opened.said == []
     assert {url.split(":")[0] for url in opened.asked} <= {"file", "data"}
-    assert [url for url in opened.asked if url.startswith("file")] == [opened.address] * opened.asked.count(
-        opened.address
-    )
+    beside = opened.address.removesuffix(".html") + "_files/"
+    assert all(url == opened.address or url.startswith((beside, "data:")) for url in opened.asked)
     opened.page.close()
 
 
@@ -96,6 +105,7 @@ def test_everything_is_drawn_without_a_word_or_a_request(browser):
         plot = page.locator(f"[data-chart={chart}]:visible").first
         plot.scroll_into_view_if_needed()
         plot.locator("svg, canvas").wait_for()
+    browser.meet()
     page.locator("#top canvas").wait_for(state="attached")
     page.locator("#strips svg").first.wait_for(state="attached")
 
@@ -150,6 +160,7 @@ def test_a_column_sorts_by_value_with_missing_numbers_last(browser):
 
 def test_the_animation_plays_and_pauses(browser):
     page = browser.page
+    browser.meet()
     page.select_option("#speed", "2")
     page.click("#play")
     assert page.get_attribute("#play", "aria-label") == "Pause"
@@ -191,8 +202,7 @@ def titles(page) -> list[str]:
 
 def test_discs_are_red_exactly_in_a_collision(browser):
     page = browser.page
-    page.select_option("#episode", label=next(title for title in titles(page) if "collision" in title))
-    page.locator("#top canvas").wait_for()
+    browser.meet(next(title for title in titles(page) if "collision" in title))
     move_to(page, 0)
     assert pixels(page, "danger") == 0
     move_to(page, 1.5)
@@ -202,6 +212,7 @@ def test_discs_are_red_exactly_in_a_collision(browser):
 def test_between_frames_players_move_on(browser):
     """Sixty times a second: the picture of two times that lie between the same two frames differs."""
     page = browser.page
+    browser.meet()
     shots = []
     for time_of in (0.901, 0.915):
         move_to(page, time_of)
@@ -221,11 +232,13 @@ def test_a_cell_of_a_heat_map_opens_its_episodes_and_the_address_keeps_the_view(
     theta = page.input_value("#types")
     assert all(f" {theta} " in title for title in titles(page))
     page.click("#next")
-    move_to(page, 0.75)
     chosen = page.locator("#episode option:checked").inner_text()
+    browser.meet(chosen)
+    move_to(page, 0.75)
     page.reload()
     assert page.locator("#episode option:checked").inner_text() == chosen
     assert page.input_value("#types") == theta
+    browser.meet()
     browser.until("document.querySelector('#clock').textContent.startsWith('0.75 s')")
 
 
@@ -240,15 +253,33 @@ def test_two_policies_from_one_start_are_drawn_over_each_other(context, tmp_path
     write_page(load(tmp_path), tmp_path / "report.html")
     opened = Browser(context, (tmp_path / "report.html").as_uri())
     assert opened.page.locator("#beside option").all_inner_texts() == ["nothing", "run_1"]
+    opened.meet()
     assert "left one, θ = 1" in opened.page.inner_text("#who")
     assert "Bodies are drawn for the eye." in opened.page.inner_text("#drawn")
     alone = opened.page.evaluate("document.querySelector('#top canvas').toDataURL()")
     opened.page.select_option("#beside", label="run_1")
+    beside = "document.querySelector('#said').textContent.includes('Beside it: run_1')"
+    opened.until(beside)
     assert opened.page.evaluate("document.querySelector('#top canvas').toDataURL()") != alone
-    assert "Beside it: run_1" in opened.page.inner_text("#said")
     opened.page.reload()
-    assert "Beside it: run_1" in opened.page.inner_text("#said")
+    opened.meet()
+    opened.until(beside)
     assert opened.said == []
+    opened.page.close()
+
+
+def test_a_page_that_was_moved_without_its_folder_says_so(context, address, tmp_path):
+    moved = shutil.copy(Path(unquote(urlparse(address).path)), tmp_path / "report.html")
+    opened = Browser(context, moved.as_uri())
+    opened.page.locator("#episodes").scroll_into_view_if_needed()
+    opened.until(
+        "document.querySelector('#said').textContent.includes('keep the folder report_files beside this page')"
+    )
+    assert opened.shown("#top") == 0
+    shutil.copytree(Path(unquote(urlparse(address).path)).parent / "report_files", tmp_path / "report_files")
+    opened.page.click("#next")
+    opened.until("document.querySelector('#said').textContent.includes('Lost against the equilibrium')")
+    assert opened.shown("#top") == 1
     opened.page.close()
 
 
@@ -259,6 +290,7 @@ def test_the_clock_says_which_branch_is_played(context, tmp_path):
     (folder / "episodes.json").write_text(json.dumps({"episodes": episodes}))
     write_page(load(folder), tmp_path / "report.html")
     opened = Browser(context, (tmp_path / "report.html").as_uri())
+    opened.meet()
     opened.until("document.querySelector('#clock').textContent === '1.50 s, branch 1'")
     assert "Passes on the other side than the equilibrium." in opened.page.inner_text("#said")
     opened.page.click("#next")
@@ -268,8 +300,26 @@ def test_the_clock_says_which_branch_is_played(context, tmp_path):
     opened.page.close()
 
 
+def test_a_print_has_what_nobody_has_looked_at(browser):
+    """Every heat map of the sweep, the encounter and the curves are drawn for a sheet before it is printed."""
+    page = browser.page
+    assert page.locator(".map svg").count() < page.locator(".map[data-level=recipe]").count()
+    page.evaluate("dispatchEvent(new Event('beforeprint'))")
+    shown = page.evaluate(
+        """() => [...document.querySelectorAll('[data-chart]')].filter((host) => host.clientWidth)
+            .map((host) => Boolean(host.querySelector('svg, canvas')))"""
+    )
+    assert all(shown)
+    assert page.locator(".map svg").count() == page.locator(".map[data-level=recipe]").count() == 18
+    assert page.locator("#top canvas").count() == 1
+    assert page.locator("#strips svg").count() > 0
+    page.evaluate("dispatchEvent(new Event('afterprint'))")
+    assert page.locator(".map:visible").count() == 12
+
+
 def test_the_keyboard_reaches_everything(browser):
     page = browser.page
+    browser.meet()
     page.focus("#play")
     page.keyboard.press("Enter")
     browser.until("document.querySelector('#play').getAttribute('aria-label') === 'Pause'")
@@ -311,7 +361,7 @@ def test_it_fits_the_width_in_light_and_in_dark(browser, width, scheme, tmp_path
     page.emulate_media(color_scheme=scheme)
     page.set_viewport_size({"width": width, "height": 900})
     page.reload()
-    page.locator("#top canvas").wait_for(state="attached")
+    browser.meet()
     assert page.evaluate("document.documentElement.scrollWidth") == width
     paper = page.evaluate("getComputedStyle(document.body).backgroundColor")
     bright = sum(int(part) for part in paper[4:-1].split(",")) > 3 * 128

@@ -8,13 +8,15 @@ import re
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 import pytest
 
 from hno.report import page_data
+from hno.report import parts as page_parts
 from hno.report.episode import closest, columns, episode
-from hno.report.page import EPISODES, embedded, render, write_page
+from hno.report.page import embedded, render, write_page
 from hno.report.recipes import recipes
 from hno.report.runs import load
 from tests.report.folders import GRID5, GRID9, make_episode, make_results, row, write_run, write_sweep
@@ -46,6 +48,12 @@ class Page(HTMLParser):
     @property
     def data(self) -> dict[str, Any]:
         return json.loads(next(text for text in self.texts if text.startswith("{") and '"charts"' in text))
+
+    @property
+    def episodes(self) -> list[dict[str, Any]]:
+        """What is listed with what the parts of the runs hold of it."""
+        data = self.data
+        return [{**one, **data["parts"][one["of"]]["episodes"][one["place"]]} for one in data["episodes"]]
 
 
 @pytest.fixture(scope="module")
@@ -127,22 +135,23 @@ def big(tmp_path_factory) -> Path:
     return write_sweep(tmp_path_factory.mktemp("big") / "sweep", 200)
 
 
-def test_two_hundred_runs_say_which_episodes_are_left_out(big):
+def test_two_hundred_runs_say_which_episodes_are_left_out(big, monkeypatch):
+    monkeypatch.setattr(page_parts, "EPISODES", 400)
     sweep = load(big)
     text = render(sweep)
     page = Page(text)
     total = sum(len(run.episodes) for run in sweep.runs)
     shown = len(page.data["episodes"])
-    assert shown == EPISODES < total
-    assert f"{shown:,} of {total:,} episodes are in this page" in text
-    told = {entry["title"].split(" · ")[0] for entry in page.data["episodes"] if " · worst" in entry["title"]}
+    assert shown == 400 < total
+    assert f"{shown:,} of {total:,} episodes are listed" in text
+    told = {sweep.runs[entry["of"]].name for entry in page.data["episodes"] if entry["kind"] == "worst"}
     assert told == {run.name for run in sweep.runs if run.episodes}
 
 
 def test_a_large_type_grid_has_all_its_cells(tmp_path):
     for seed in range(3):
         write_run(tmp_path / str(seed), make_results("drone", "sno", "tanh", seed, np.random.default_rng(seed), GRID9))
-    assert len(Page(render(load(tmp_path))).data["maps"]["map0"]) == 81
+    assert len(Page(render(load(tmp_path))).data["maps"]["map0"]["cells"]) == 81
 
 
 def test_one_run_is_enough(tmp_path):
@@ -164,8 +173,9 @@ def test_no_safe_start_is_no_zero(tmp_path):
     write_run(tmp_path, results, extras=False)
     text = render(load(tmp_path))
     assert "the collision rate is n/a" in text
-    (cell,) = Page(text).data["maps"]["map0"]
-    assert (cell["safe_starts"], cell["rate"], cell["interval"], cell["relative_excess"]) == (0, None, None, None)
+    (cell,) = Page(text).data["maps"]["map0"]["cells"]
+    assert (cell["safe_starts"], cell["rate"], cell["interval"]) == (0, None, None)
+    assert "no safe start: rate n/a\nmedian excess cost n/a" in cell["tip"]
 
 
 def test_types_that_are_not_pairs_have_numbers_and_no_map(tmp_path):
@@ -173,7 +183,8 @@ def test_types_that_are_not_pairs_have_numbers_and_no_map(tmp_path):
     write_run(tmp_path, results, extras=False)
     text = render(load(tmp_path))
     assert 'data-chart="heat"' not in text
-    assert "(1, 2, 3)" in Page(text).texts
+    (((name, _), *_),) = Page(text).data["maps"]["map0"]["rows"]
+    assert name == "(1, 2, 3)"
 
 
 def test_a_watched_page_says_so_and_others_do_not(small_sweep, small_page):
@@ -189,7 +200,28 @@ def test_a_page_is_written_whole_or_not_at_all(small_sweep, tmp_path, monkeypatc
     with pytest.raises(OSError, match="full"):
         write_page(small_sweep, target)
     assert target.read_bytes() == b"before"
-    assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
+    assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == ["report.html"]
+
+
+def test_what_several_runs_show_lies_beside_the_page_and_of_one_run_in_it(small_sweep, tmp_path):
+    """In files that hold numbers alone; those that no page needs any more go, whatever else lies there."""
+    path, folder = tmp_path / "a b.html", tmp_path / "a b_files"
+    write_page(small_sweep, path)
+    kept = Page(path.read_text()).data["parts"]
+    assert [part is None for part in kept] == [not (run.table or run.episodes) for run in small_sweep.runs]
+    files = {unquote(part) for part in kept if part}
+    assert {f"{folder.name}/{file.name}" for file in folder.iterdir()} == files
+    whole = Page(render(small_sweep)).data["parts"]
+    for part, content in zip(kept, whole, strict=True):
+        if part:
+            text = (tmp_path / unquote(part)).read_text()
+            assert json.loads(text.removeprefix(page_parts.CALL).removesuffix(");\n")) == content
+    (folder / "mine.js").write_text("")
+    write_page(small_sweep._replace(runs=small_sweep.runs[:2]), path)
+    assert len([*folder.iterdir()]) == 3
+    write_page(small_sweep._replace(runs=small_sweep.runs[:1]), path)
+    assert [file.name for file in folder.iterdir()] == ["mine.js"]
+    assert Page(path.read_text()).data["parts"][0]["episodes"]
 
 
 def test_the_player_gets_what_the_file_holds():
@@ -244,7 +276,7 @@ def test_episodes_of_any_number_of_players_and_without_a_distance_are_shown(tmp_
     entry["radius"] = None if radius is None else [radius] * 5
     folder = write_run(tmp_path, make_results("own", "sno", "tanh", 0, np.random.default_rng(0), GRID5[:1]))
     (folder / "episodes.json").write_text(json.dumps({"episodes": [entry]}))
-    (shown,) = Page(render(load(folder))).data["episodes"]
+    (shown,) = Page(render(load(folder))).episodes
     assert len(shown["p"][0]) == players
     assert (shown["distance"] is None) == (players == 1)
     assert ("collision radius" in shown["said"]) == (radius is not None)
@@ -257,10 +289,10 @@ def test_branches_and_the_other_side_are_told(tmp_path):
     folder = write_run(tmp_path, make_results("own", "sno", "tanh", 0, np.random.default_rng(0), GRID5[:1]))
     (folder / "episodes.json").write_text(json.dumps({"episodes": entries}))
     page = Page(render(load(folder)))
-    worst, typical = page.data["episodes"]
+    worst, typical = page.episodes
     assert worst["branch"] == [0, 0, 1, 1, 1]
     assert typical["branch"] is None
-    assert [("other side" in one["title"], "other side" in one["said"]) for one in (worst, typical)] == [
+    assert [(one.get("other_side", False), "other side" in one["said"]) for one in (worst, typical)] == [
         (True, True),
         (False, False),
     ]

@@ -42,10 +42,54 @@ function sortBy(table, column, descending) {
   });
 }
 
-for (const table of all("table")) {
+function sortable(table) {
   [...table.tHead.rows[0].cells].forEach((head, column) => {
     head.querySelector("button").addEventListener("click", () =>
       sortBy(table, column, head.getAttribute("aria-sort") === "ascending"),
     );
   });
+  return table;
+}
+all("table").forEach(sortable);
+
+/** A table from its texts, each with the number that it is sorted by. */
+function tableOf({ columns, rows }) {
+  const heads = columns.map((title) => element("th", { scope: "col" }, element("button", { type: "button", textContent: title })));
+  const cell = ([text, order]) => {
+    const made = element("td", { textContent: text, className: order === null && text !== "n/a" ? "" : "n" });
+    if (order !== null) made.dataset.o = order;
+    return made;
+  };
+  const lines = rows.map((row) => element("tr", {}, ...row.map(cell)));
+  return sortable(element("table", {}, element("thead", {}, element("tr", {}, ...heads)), element("tbody", {}, ...lines)));
+}
+
+/** A file beside the page calls one of these; a page from disk can load scripts alone. */
+const arrivals = new WeakMap();
+window.hnoLandscape = window.hnoPart = (content) => arrivals.get(document.currentScript)?.(content);
+
+/** What a file hands over. `keep` says what must lie beside the page. */
+function load(src, keep) {
+  return new Promise((resolve, reject) => {
+    const script = element("script", { src });
+    const fail = () => reject(new Error(`${decodeURIComponent(src)} cannot be loaded: keep ${keep} beside this page.`));
+    arrivals.set(script, resolve);
+    script.addEventListener("error", fail);
+    script.addEventListener("load", () => {
+      script.remove();
+      fail(); // does nothing once the content is here
+    });
+    document.body.append(script);
+  });
+}
+
+/** What the page shows of a single run: its heat map and its episodes. */
+const parts = new Map();
+function part(k) {
+  const found = DATA.parts[k];
+  if (!parts.has(k)) {
+    parts.set(k, typeof found === "string" ? load(found, `the folder ${decodeURIComponent(found.split("/")[0])}`) : Promise.resolve(found));
+    parts.get(k).catch(() => parts.delete(k)); // somebody may put it back
+  }
+  return parts.get(k);
 }

@@ -42,24 +42,55 @@ async function draw(host, name, data, values = {}, renderer = "svg") {
   return made.view;
 }
 
-function drawHeat(host) {
-  const cells = DATA.maps[host.dataset.of];
+/** The heat map of a card: of a recipe in the page, of a single run in its part. */
+const mapOf = ({ card, run }) => (run === undefined ? Promise.resolve(DATA.maps[card]) : part(Number(run)).then((found) => found.map));
+
+async function drawHeat(host) {
+  const card = host.closest(".map");
+  const { cells } = await mapOf(card.dataset).catch((error) => {
+    host.textContent = error.message;
+    return {};
+  });
+  if (!cells) return;
   const columns = new Set(cells.map((cell) => cell.theta[0])).size;
   const step = Math.max(13, Math.min(38, Math.floor((host.clientWidth - 44) / columns)));
   const values = { x_step: step, y_step: step, small: step < 26, bound: $("shown").value };
-  draw(host, "heat", { cells }, values).then((view) =>
-    view?.addEventListener("click", (_event, item) => {
-      const theta = item?.datum?.theta;
-      if (!theta || !$("player")) return;
-      choose_type(`(${theta.join(", ")})`, DATA.members[host.dataset.of]);
-      $("episodes").scrollIntoView();
-    }),
-  );
+  const view = await draw(host, "heat", { cells }, values);
+  view?.addEventListener("click", (_event, item) => {
+    const theta = item?.datum?.theta;
+    if (!theta || !$("player")) return;
+    choose_type(`(${theta.join(", ")})`, DATA.members[card.dataset.card]);
+    $("episodes").scrollIntoView();
+  });
 }
+
+for (const numbers of all(".numbers"))
+  numbers.addEventListener("toggle", async () => {
+    if (numbers.querySelector(".scroll")) return;
+    const box = numbers.appendChild(element("div", { className: "scroll" }));
+    mapOf(numbers.closest(".map").dataset).then(
+      (found) => box.append(tableOf(found)),
+      (error) => box.append(error.message),
+    );
+  });
 
 function drawComparison(host) {
   const rows = DATA.comparison.filter((row) => row.game === host.dataset.of && (row.seed === null || matches(row)));
   draw(host, "comparison", { recipes: rows.filter((row) => matches({ ...row, seed: undefined })) });
+}
+
+/** How near episodes come: a line per recipe, and a dashed one for the equilibria from the same starts. */
+function drawClearances(host) {
+  const told = DATA.clearances.filter((one) => one.game === host.dataset.of && matches(one));
+  host.closest("figure").hidden = !told.length;
+  if (!told.length) return;
+  const percent = (share) => `${Number((100 * share).toPrecision(3))} %`;
+  const rows = ({ recipe, d, unit }, shares, label) =>
+    shares.map((share, k) => ({ recipe, d: d[k], share, label, tip: `${label ? "equilibria" : recipe}\n${percent(share)} keep no more than ${d[k]} ${unit}` }));
+  const labels = [...new Map(told.map((one) => [String(one.label), one])).values()];
+  const points = [...told.flatMap((one) => rows(one, one.share, false)), ...labels.flatMap((one) => rows(one, one.label, true))];
+  const unit = told[0].unit ? ` [${told[0].unit}]` : "";
+  draw(host, "clearances", { points }, { near: `safe starts whose smallest clearance is at most d${unit}` });
 }
 
 function drawCurves(host) {
@@ -87,7 +118,7 @@ function meaning(metric) {
   return (known.find(([start]) => metric.startsWith(start)) ?? ["", "as logged"])[1];
 }
 
-const kinds = { heat: drawHeat, comparison: drawComparison, curves: drawCurves };
+const kinds = { heat: drawHeat, comparison: drawComparison, clearances: drawClearances, curves: drawCurves };
 const pending = new Set(all("[data-chart]"));
 const visible = new Set();
 
@@ -114,6 +145,18 @@ const watcher = new IntersectionObserver(
 );
 for (const host of pending) watcher.observe(host);
 
+/** Do something once: when a part of the page comes into view, or before it is printed. */
+function whenSeen(host, then) {
+  const once = () => {
+    seen.disconnect();
+    removeEventListener("beforeprint", once);
+    then();
+  };
+  const seen = new IntersectionObserver((entries) => entries.some((entry) => entry.isIntersecting) && once(), { rootMargin: "300px" });
+  seen.observe(host);
+  addEventListener("beforeprint", once);
+}
+
 const FIRST = 12;
 let unfolded = false;
 /** Shows the first heat maps, and the others on demand. */
@@ -129,7 +172,7 @@ $("more")?.addEventListener("click", () => {
   unfolded = true;
   foldMaps();
 });
-listeners.push(foldMaps, () => redraw("comparison", "curves"));
+listeners.push(foldMaps, () => redraw("comparison", "clearances", "curves"));
 
 const metric = $("metric");
 if (metric) {

@@ -2,12 +2,10 @@
 const [FINE, COARSE, ARROWS, TYPES] = [33, 17, 9, 5];
 /** Largest difference between the values of this page and Python's, relative to |value| + median |value|. */
 const TOLERANCE = 0.01;
-const land = { content: null, evaluate: null, waiting: null, error: null, turn: 0, across: "", up: "", tau: 0, theta: [], at: {} };
-
-/** A file of a run calls this. */
-window.hnoLandscape = (content) => land.waiting?.(content);
+const land = { content: null, evaluate: null, file: null, error: null, turn: 0, across: "", up: "", tau: 0, theta: [], at: {} };
 
 const coordinate = (name) => land.content.coordinates.find((one) => one.name === name);
+const short = (value) => Number(Number(value).toPrecision(3));
 const dot = (a, b, from = 0) => a.reduce((sum, one, k) => sum + one * b[from + k], 0);
 const apart = (one, other) => dot(one.weights, other.weights) === 0;
 
@@ -152,7 +150,7 @@ function family(n, shown) {
 function showLevels(found) {
   const select = $("land-level");
   const before = select.value;
-  const texts = found.map((level) => String(Number(level.toPrecision(3))));
+  const texts = found.map((level) => String(short(level)));
   select.replaceChildren(element("option", { value: "", textContent: "none" }), ...texts.map((text) => element("option", { value: text, textContent: text })));
   select.value = texts.includes(before) ? before : "";
   select.disabled = !land.evaluate;
@@ -182,7 +180,7 @@ function showValue(at, values, n, title) {
   });
   if (!sides.every(({ place }) => place >= 0 && place < n)) return;
   const found = values[sides[1].place * n + sides[0].place];
-  const where = sides.map(({ name, unit, value }) => `${name} ${Number(value.toPrecision(3))} ${unit}`).join(", ");
+  const where = sides.map(({ name, unit, value }) => `${name} ${short(value)} ${unit}`).join(", ");
   $("land-at").textContent = `${where}: ${title} ${Number.isFinite(found) ? Number(found.toPrecision(4)) : "n/a"}`;
 }
 
@@ -224,6 +222,8 @@ function drawLandscape(coarse = false) {
     surface("land-truth", wanted, n, scale, barrier);
     surface("land-error", off, n, { ...scaleOf(off, true), title: "difference" }, barrier);
   }
+  const run = DATA.landscapes[$("land-run").value].run;
+  $("land-what").textContent = `Learned: ${shown.title} of ${run}, θ = (${land.theta.map(short).join(", ")}), ${short(land.tau)} s to go`;
   $("land-said").textContent = said(compared, values, wanted);
   land.drawn = { n, values, shown };
 }
@@ -240,6 +240,7 @@ function drawFilm(k) {
   const title = potential ? "W" : `V${place + 1}`;
   for (const name of ["truth", "error"]) $(`land-${name}-box`).hidden = true;
   surface("land-learned", all_frames[k], film.points, { ...scaleOf([...all_frames.flat(), ...wanted], false), title, level: [] }, film.violation);
+  $("land-what").textContent = `Learned: ${title} after step ${film.frames[k].step}`;
   $("land-film-step").textContent = `step ${film.frames[k].step}`;
   $("land-said").textContent = `${title} after step ${film.frames[k].step}, frame ${k + 1} of ${film.frames.length}, from Python.`;
 }
@@ -280,7 +281,7 @@ function difference() {
 function slider(name, value, [lo, hi], unit, set) {
   const input = element("input", { type: "range", min: lo, max: hi, step: "any", value });
   const shown = element("output");
-  const show = () => (shown.textContent = `${Number(Number(input.value).toPrecision(3))} ${unit}`);
+  const show = () => (shown.textContent = `${short(input.value)} ${unit}`);
   input.addEventListener("input", () => {
     set(Number(input.value));
     show();
@@ -333,15 +334,19 @@ function received(content) {
   resetLandscape();
 }
 
-/** Load the file of a run; a page from disk may load scripts only. */
-function loadLandscape() {
+/** Load the file of the chosen run, and show it once the section is seen. */
+async function loadLandscape() {
   const { src, run } = DATA.landscapes[$("land-run").value];
-  const script = element("script", { src });
   $("land-said").textContent = `Loading ${decodeURIComponent(src)} ...`;
-  land.waiting = received;
-  script.addEventListener("error", () => ($("land-said").textContent = `${decodeURIComponent(src)} cannot be loaded: keep the folder of ${run} beside this page.`));
-  script.addEventListener("load", () => script.remove());
-  document.body.append(script);
+  const file = (land.file = load(src, `the folder of ${run}`));
+  try {
+    const content = await file;
+    if (land.file !== file) return;
+    land.arrived = content;
+    if (land.seen) received(content);
+  } catch (error) {
+    if (land.file === file) $("land-said").textContent = error.message;
+  }
 }
 
 function listLandscapes() {
@@ -351,7 +356,7 @@ function listLandscapes() {
   select.replaceChildren(...left.map((k) => element("option", { value: k, textContent: DATA.landscapes[k].run })));
   $("landscape").hidden = !left.length;
   if (before && left.includes(Number(before))) select.value = before;
-  else if (land.content && left.length) loadLandscape();
+  else if (left.length) loadLandscape();
 }
 
 if ($("landscape")) {
@@ -369,12 +374,11 @@ if ($("landscape")) {
       drawLandscape();
     });
   }
-  for (const event of ["resize", "beforeprint", "afterprint"]) addEventListener(event, () => setTimeout(drawLandscape, 200));
+  for (const event of ["resize", "afterprint"]) addEventListener(event, () => setTimeout(drawLandscape, 200));
+  addEventListener("beforeprint", () => drawLandscape());
   dark.addEventListener("change", () => drawLandscape());
-  const seen = new IntersectionObserver((entries) => {
-    if (land.content || !entries.some((entry) => entry.isIntersecting)) return;
-    seen.disconnect();
-    loadLandscape();
-  }, { rootMargin: "300px" });
-  seen.observe($("landscape"));
+  whenSeen($("landscape"), () => {
+    land.seen = true;
+    if (land.arrived) received(land.arrived);
+  });
 }

@@ -1,7 +1,8 @@
 /** Plays one episode, perhaps with another policy's beside it: views, and numbers over time below them. */
-const player = { time: 0, fresh: true, playing: false, episode: null, beside: null, views: [], strips: [], type: "" };
+const player = { time: 0, fresh: true, playing: false, seen: false, turn: 0, episode: null, beside: null, views: [], strips: [], type: "" };
 const nameOf = (episode) => [episode.run, episode.theta.join(","), episode.kind].join("|");
 const typeOf = (episode) => `(${episode.theta.join(", ")})`;
+const titleOf = (episode) => [episode.run, typeOf(episode), episode.kind, ...(episode.collided ? ["collision"] : []), ...(episode.other_side ? ["other side"] : [])].join(" · ");
 const ended = () => player.episode.t.at(-1);
 
 function makeViews(episode) {
@@ -59,7 +60,7 @@ async function drawStrips(episode, scene) {
   const wanted = strips(episode, scene);
   const hosts = wanted.map(([, , name]) => {
     const plot = element("div", { className: "plot" });
-    const host = element("div", { className: "strip" }, plot, element("div", { className: "now" }));
+    const host = element("div", { className: "strip" }, plot, element("canvas", { className: "now" }));
     host.setAttribute("role", "img");
     host.setAttribute("aria-label", `${name}, by player`);
     return host;
@@ -73,16 +74,31 @@ async function drawStrips(episode, scene) {
   seek(player.time);
 }
 
-function show() {
-  const episode = DATA.episodes[$("episode").value];
-  if (!episode) return;
-  player.episode = episode;
-  player.beside = DATA.episodes[$("beside").value] ?? null;
+/** An episode of the list with what its run's part holds of it. */
+const whole = async (one) => one && { ...one, ...(await part(one.of)).episodes[one.place] };
+
+/** Loads what is chosen, and draws it once the player is seen. */
+async function show() {
+  const turn = ++player.turn;
+  const chosen = [$("episode"), $("beside")].map((select) => DATA.episodes[select.value]);
+  if (!chosen[0]) return;
+  const found = await Promise.all(chosen.map(whole)).catch((error) => error);
+  if (turn !== player.turn) return;
+  const lost = found instanceof Error;
+  $("player").toggleAttribute("data-lost", lost);
+  if (lost) $("said").textContent = found.message;
+  [player.episode, player.beside = null] = lost ? [null] : found;
+  player.views = [];
+  if (player.seen && !lost) drawEpisode();
+}
+
+function drawEpisode() {
+  const { episode, beside } = player;
   const scene = DATA.scenes[episode.game] ?? {};
   $("said").replaceChildren(
     element("span", { className: `tag ${episode.collided ? "bad" : "ok"}`, textContent: episode.collided ? "collision" : "safe" }),
     ` ${episode.said}`,
-    ...(player.beside ? [element("br"), `Beside it: ${player.beside.said}`] : []),
+    ...(beside ? [element("br"), `Beside it: ${beside.said}`] : []),
   );
   makeViews(episode);
   legend(episode, scene);
@@ -94,24 +110,25 @@ function show() {
 
 /** Moves to a time, s; between frames places are interpolated. */
 function seek(time) {
+  if (!player.views.length) return;
   player.time = Math.max(0, Math.min(time, ended()));
   const { episode, beside } = player;
   const branch = episode.branch?.[place(episode.t, player.time + 1e-9).low];
   const clock = `${player.time.toFixed(2)} s${branch === undefined ? "" : `, branch ${branch}`}`;
+  const moment = { episode, beside, scene: DATA.scenes[episode.game] ?? {}, time: player.time, follow: $("follow").checked };
+  known.clear();
+  for (const view of player.views) paint(view, moment); // before anything changes: it asks for the size of the canvas
+  for (const strip of player.strips) mark(strip, player.time);
   $("scrub").value = player.time;
   $("scrub").setAttribute("aria-valuetext", clock);
   $("clock").textContent = clock;
-  const moment = { episode, beside, scene: DATA.scenes[episode.game] ?? {}, time: player.time, follow: $("follow").checked };
-  for (const view of player.views) paint(view, moment);
-  for (const { view, host } of player.strips)
-    host.lastChild.style.left = `${view.origin()[0] + view.scale("x")(player.time) + view.padding().left}px`;
 }
 
 function play(on) {
   player.playing = on;
   $("play").textContent = on ? "❚❚" : "▶";
   $("play").setAttribute("aria-label", on ? "Pause" : "Play");
-  if (!on) return;
+  if (!on || !player.views.length) return;
   if (player.fresh || player.time >= ended()) seek(0);
   player.fresh = false;
   let last = performance.now();
@@ -132,7 +149,8 @@ function list(wanted) {
     const one = DATA.episodes[k];
     return matches(one) && (!player.type || typeOf(one) === player.type) && (!player.runs || player.runs.includes(one.run));
   });
-  select.replaceChildren(...left.map((k) => element("option", { value: k, textContent: DATA.episodes[k].title })));
+  if (player.listed !== String(left)) select.replaceChildren(...left.map((k) => element("option", { value: k, textContent: titleOf(DATA.episodes[k]) })));
+  player.listed = String(left);
   if (before !== "" && left.includes(Number(before))) select.value = before;
   $("player").hidden = !left.length;
   $("none").hidden = Boolean(left.length);
@@ -156,7 +174,7 @@ function pick() {
   player.fresh = true;
   listBeside();
   show();
-  remember({ episode: nameOf(player.episode), beside: "", t: "" });
+  remember({ episode: nameOf(DATA.episodes[$("episode").value]), beside: "", t: "" });
 }
 
 function turn(by) {
@@ -190,13 +208,14 @@ function recall() {
   if (other >= 0) $("beside").value = String(other);
   if (other >= 0) show();
   if (t) {
-    player.fresh = false;
-    seek(Number(t) || 0);
+    Object.assign(player, { fresh: false, time: Number(t) || 0 });
+    show();
   }
   remember({ episode, beside: other >= 0 ? beside : "", t: t ?? "" });
 }
 
 if ($("player")) {
+  for (const one of DATA.episodes) Object.assign(one, DATA.runs[one.of]);
   const types = [...new Set(DATA.episodes.map(typeOf))].sort((a, b) => a.localeCompare(b, "en", { numeric: true }));
   $("types").append(...types.map((type) => element("option", { value: type, textContent: type })));
   $("play").addEventListener("click", () => play(!player.playing));
@@ -215,7 +234,8 @@ if ($("player")) {
   $("ofmap").addEventListener("click", () => choose_type("", null));
   $("beside").addEventListener("change", () => {
     show();
-    remember({ beside: player.beside ? nameOf(player.beside) : "" });
+    const beside = DATA.episodes[$("beside").value];
+    remember({ beside: beside ? nameOf(beside) : "" });
   });
   $("previous").addEventListener("click", () => turn(-1));
   $("next").addEventListener("click", () => turn(1));
@@ -231,11 +251,15 @@ if ($("player")) {
     rotate();
   });
   listeners.push(() => list());
-  const again = () => player.episode && !$("player").hidden && show();
+  const again = () => player.seen && player.episode && !$("player").hidden && drawEpisode();
   dark.addEventListener("change", again);
   addEventListener("resize", () => setTimeout(again, 200));
   addEventListener("beforeprint", again);
   addEventListener("afterprint", again);
+  whenSeen($("episodes"), () => {
+    player.seen = true;
+    again();
+  });
   recallers.push(recall);
 }
 readAddress();

@@ -1,5 +1,9 @@
 /** Draws an episode at any moment into a canvas: from above, from the side, or in space. Lengths are to scale. */
-const color = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
+const known = new Map(); // until the next picture
+function color(name) {
+  if (!known.has(name)) known.set(name, getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim());
+  return known.get(name);
+}
 const category = () => theme().config.range.category;
 const mix = (a, b, share) => a.map((value, k) => value + share * (b[k] - value));
 
@@ -108,7 +112,7 @@ function ruler(ctx, view, width, height) {
   for (let x = Math.ceil(left / step) * step; x < right; x += step) {
     const at = (x - left) * view.scale;
     line(ctx, [[at, height], [at, height - 4]], { strokeStyle: color("muted") });
-    if (at > 40 && at < width - 40) write(ctx, `${+x.toPrecision(6)}`, at, height - 7, { textAlign: "center" });
+    if (at > 40 && at < width - 56) write(ctx, `${+x.toPrecision(6)}`, at, height - 7, { textAlign: "center" });
   }
   for (let y = Math.ceil(bottom / step) * step; y < top; y += step) {
     const at = height - (y - bottom) * view.scale;
@@ -221,8 +225,8 @@ function seen(view, episode, beside, time, follow) {
   return follow ? extent(view, at(episode.t, episode.p, time), 2.2 * radius + 2) : extent(view, all, 0.7 * radius + 1);
 }
 
-function paint(view, { episode, beside, scene, time, follow }) {
-  const canvas = view.canvas;
+/** An empty canvas, drawn on in pixels of the page. */
+function cleared(canvas) {
   const [width, height] = [canvas.clientWidth, canvas.clientHeight];
   const ratio = devicePixelRatio || 1;
   if (canvas.width !== Math.round(width * ratio) || canvas.height !== Math.round(height * ratio))
@@ -230,6 +234,11 @@ function paint(view, { episode, beside, scene, time, follow }) {
   const ctx = canvas.getContext("2d");
   ctx.setTransform(ratio, 0, 0, ratio, 0, 0);
   ctx.clearRect(0, 0, width, height);
+  return { ctx, width, height };
+}
+
+function paint(view, { episode, beside, scene, time, follow }) {
+  const { ctx, width, height } = cleared(view.canvas);
   fit(view, seen(view, episode, beside, time, follow && view.kind !== "space"), width, height, 16);
   roads(ctx, view, scene, width, height);
   const now = at(episode.t, episode.p, time);
@@ -243,4 +252,11 @@ function paint(view, { episode, beside, scene, time, follow }) {
   players(ctx, view, episode, scene, time, false);
   changes(ctx, view, episode, time);
   ruler(ctx, view, width, height);
+}
+
+/** The moment in a chart over time. A canvas, since an element that moves costs all layers of the page. */
+function mark({ view, host }, time) {
+  const { ctx, height } = cleared(host.lastChild);
+  const x = Math.round(view.origin()[0] + view.scale("x")(time) + view.padding().left) + 0.5;
+  line(ctx, [[x, 0], [x, height]], { strokeStyle: color("ink"), dash: [3, 3] });
 }
