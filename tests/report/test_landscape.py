@@ -222,10 +222,11 @@ def test_a_file_that_has_gone_is_named(context, content, tmp_path):  # noqa: F81
         'hnoLandscape({"reason":"\u2028"});\n',
         "\ufeffhnoLandscape({});\n",
         'hnoLandscape({"players":2',
+        "hnoLandscape({}",
         "hnoLandscape(" + "[" * 100_000 + ");\n",
         "",
     ],
-    ids=range(10),
+    ids=range(11),
 )
 def test_a_script_that_says_more_than_numbers_is_not_loaded(tmp_path, text):
     """A page would run it, whoever wrote the folder."""
