@@ -20,7 +20,7 @@ from hno.cli.objective import objective
 from hno.cli.resume import training_hash
 from hno.cli.settings import COMMANDS, TrainSettings
 from hno.training.callbacks import callbacks
-from hno.training.fit import Settings
+from hno.training.settings import Settings
 from hno.training.trainer import CONTROLLED, OWN, PROFILERS, make_trainer
 from tests.cli.conftest import SMOKE, Command, refused
 from tests.cli.test_configs import composed

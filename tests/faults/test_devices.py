@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from hno.training.fit import Settings
+from hno.training.settings import Settings
 from hno.training.trainer import make_trainer
 from tests.cli import conftest
 from tests.cli.conftest import SMOKE, Command, refused
