@@ -71,7 +71,7 @@ class Ranks:
         distributed.all_reduce(sums)
         *grads, used = sums.split([*(each.numel() for each in known), len(known)])
         for parameter, grad, ranks in zip(known, grads, used.tolist(), strict=True):
-            parameter.grad = grad.view_as(parameter) if ranks else None
+            parameter.grad = grad.view_as(parameter).clone() if ranks else None  # BLAS rounds by how memory is aligned
 
     def check_alike(self, parameters: Iterable[nn.Parameter]) -> None:
         """Make sure that all ranks have the same weights, as they do where equal steps are taken on equal devices.
@@ -108,19 +108,21 @@ class Ranks:
         return int(found)
 
 
-class _Here(LightningEnvironment):
-    """One machine whose processes are there already."""
+class Here(LightningEnvironment):
+    """One machine whose processes are there already, also on a cluster."""
 
     creates_processes_externally = True
 
-    def __init__(self, number: int) -> None:
+    def __init__(self, number: int = 0) -> None:
         super().__init__()
         self.number = number
 
     def local_rank(self) -> int:
+        """Which of its devices this process has."""
         return self.number
 
     def node_rank(self) -> int:
+        """There is no other machine."""
         return 0
 
 
@@ -132,7 +134,7 @@ class Together(DDPStrategy):
     """
 
     def __init__(self, ranks: Ranks) -> None:
-        super().__init__(cluster_environment=_Here(ranks.number))
+        super().__init__(cluster_environment=Here(ranks.number))
         self.ranks = ranks
 
     def _configure_launcher(self) -> None:

@@ -27,7 +27,7 @@ MOMENT = 2.0
 """Time in which the end of another rank is noticed, s."""
 LONGEST = 60.0
 """Time after which this process ends, come what may, once another rank has failed, s."""
-HOST, HERE = "127.0.0.1", "here"
+HOST, BEGUN, HERE = "127.0.0.1", "begun", "here"
 Follow = Callable[[Ranks], object]
 """What the other ranks do."""
 
@@ -52,6 +52,7 @@ def together(count: int, follow: Follow) -> Iterator[Ranks]:
         return
     others = _Others(count, follow)
     try:
+        others.have(BEGUN)  # what is sent to them is changed from here on
         yield Ranks(0, count, others.meet)
     except BaseException as error:
         reason = others.reason(error)
@@ -75,13 +76,17 @@ class _Others:
             other.add_done_callback(self._ended)
 
     def meet(self) -> Store:
-        """Wait until all are there."""
-        while self.store.add(HERE, 0) < self.count - 1:
+        """Wait until all are where they become one group."""
+        self.have(HERE)
+        return self.store
+
+    def have(self, key: str) -> None:
+        """Wait until all have said so."""
+        while self.store.add(key, 0) < self.count - 1:
             stop_if_asked()
             if self.failed:
                 raise RankError(self.failed[0])
             time.sleep(0.05)
-        return self.store
 
     def reason(self, error: BaseException) -> str | None:
         """Why another one failed, if what happened here is due to it; what happens in all ranks is nobody's fault."""
@@ -122,6 +127,7 @@ def _rank(number: int, count: int, port: int, threads: int, follow: Follow) -> s
     warnings.simplefilter("ignore")
     torch.set_num_threads(threads)
     store = TCPStore(HOST, port, is_master=False)
+    store.add(BEGUN, 1)
 
     def meet() -> Store:
         store.add(HERE, 1)
@@ -140,6 +146,9 @@ def _rank(number: int, count: int, port: int, threads: int, follow: Follow) -> s
 
 
 def _said(error: BaseException) -> str:
+    """An error in words; of what cannot be sent to a process or read there, the last line of a traceback."""
+    if error.__cause__ is not None:
+        return str(error.__cause__).strip(' "\n').splitlines()[-1]
     return f"{type(error).__name__}: {error}"
 
 

@@ -16,7 +16,7 @@ from hno.data import GameData
 from hno.losses import Objective
 from hno.registry import UnknownNameError, unknown_name
 from hno.training.divergence import StopOnDivergence
-from hno.training.ranks import Ranks, Together
+from hno.training.ranks import Here, Ranks, Together
 from hno.training.saving import LAST, CheckpointFiles
 from hno.training.settings import Settings
 
@@ -99,7 +99,7 @@ def device_count(settings: Settings) -> int:
     """
     found = L.Trainer(
         accelerator=settings.accelerator, devices=settings.devices, logger=False, enable_checkpointing=False,
-        enable_progress_bar=False, enable_model_summary=False,
+        enable_progress_bar=False, enable_model_summary=False, plugins=[Here()],
     ).num_devices  # fmt: skip
     if found > 1 and settings.strategy == "single_device":
         raise ValueError(
@@ -170,7 +170,7 @@ def make_trainer(
         num_sanity_val_steps=0,
         logger=list(loggers) or False,
         callbacks=[StopOnDivergence(folder, files), *callbacks, keeping_last],
-        plugins=[files],
+        plugins=[files, *([Here()] if ranks.count == 1 else [])],
         profiler=profiler(settings.profiler, folder),
         enable_progress_bar=any(isinstance(callback, ProgressBar) for callback in callbacks),
         default_root_dir=folder,
