@@ -104,7 +104,11 @@ def test_two_processes_train_as_one(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     losses by a per cent in one process too.
     """
     monkeypatch.setattr(AdaptiveLabels, "_solved", fake_round)
-    options = {"adaptive": Adaptive(2, labels=6, candidates=16, types=2), "gradient_clip_val": 0.5, "polish": 3}
+    options: dict[str, Any] = {
+        "adaptive": Adaptive(2, labels=6, candidates=16, types=2),
+        "gradient_clip_val": 0.5,
+        "polish": 3,
+    }
     one, alone, found = trained(tmp_path / "one", 1, **options)
     two, operator, again = trained(tmp_path / "two", 2, **options)
     assert len(one.losses) == len(two.losses) == STEPS
@@ -226,8 +230,8 @@ def test_all_processes_agree_that_a_training_diverges(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_callbacks_that_end_a_training_end_all(tmp_path: Path) -> None:
-    stopping = callbacks.get("early_stopping")(patience=1, min_delta=1e9)
-    _, _, found = trained(tmp_path, 2, validation=[], callbacks=[stopping])
+    stopping: Any = callbacks.get("early_stopping")
+    _, _, found = trained(tmp_path, 2, validation=[], callbacks=[stopping(patience=1, min_delta=1e9)])
     assert found.trainer.global_step == 2 * EVERY
 
 
