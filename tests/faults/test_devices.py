@@ -41,7 +41,6 @@ def test_alone_a_process_trains_with_the_usual_strategy(tmp_path: Path) -> None:
         (("trainer.accelerator=abacus",), "abacus"),
         (("trainer.precision=8",), "trainer.precision"),
         (("trainer.precision=transformer-engine",), "trainer.precision"),
-        (("trainer.strategy=fsdp",), "trainer.strategy must be auto, single_device, ddp; got 'fsdp'"),
         (("trainer.devices=2", "trainer.strategy=single_device"), "asks for 2 devices, trainer.strategy=single_device"),
         (("trainer.devices=2", "data.batch_sizes.bvp=1"), "2 devices, but a step has 1 rows of data.batch_sizes.bvp"),
         (("+trainer.num_nodes=2",), "a run trains on one machine"),

@@ -33,7 +33,7 @@ from hno.training.validation import ClosedLoopValidation
 from hno.types import Extremal, Sample, Trajectory
 from tests.fakes import fake_solve
 from tests.operators.conftest import small_operator
-from tests.training.test_fit import WEIGHTS, PowerCut, PowerCutError, equal, labelled_data, settings
+from tests.training.test_fit import WEIGHTS, PowerCut, PowerCutError, equal, labelled_data, potential_operator, settings
 
 STEPS, EVERY = 50, 10
 
@@ -44,7 +44,7 @@ def doubled(sample: Sample) -> Sample:
     assert types is not None
     return Sample(
         type(points)(*(column.double() for column in points)),
-        None if labels is None else type(labels)(*(column.double() for column in labels)),
+        None if labels is None else type(labels)(*(c.double() if c.is_floating_point() else c for c in labels)),
         types._replace(distinct=types.distinct.double()),
     )
 
@@ -71,9 +71,11 @@ class Watch(L.Callback):
 
 def trained(folder: Path, devices: int, *, double: bool = True, **changes: Any) -> tuple[Watch, ValueOperator, Fitted]:
     """A training with everything in it that has to be the same in all processes."""
-    operator, watch = small_operator(), Watch()
-    objective = make_objective({name: {} for name in WEIGHTS}, WEIGHTS, balance=True, hardest=0.5)
-    data = labelled_data(sampler={"box": 0.3, "labels": 0.3, "rollout": 0.4})
+    potential = changes.pop("potential", False)
+    operator, watch = potential_operator() if potential else small_operator(), Watch()
+    weights = WEIGHTS | ({"branches": 1.0} if potential else {})
+    objective = make_objective({name: {} for name in weights}, weights, balance=True, hardest=0.5)
+    data = labelled_data(sampler={"box": 0.3, "labels": 0.3, "rollout": 0.4}, potential=potential)
     data.setup("fit")
     data.batch_sizes["terminal"] = 7
     if double:
@@ -97,7 +99,12 @@ def apart(one: list[float], other: list[float]) -> float:
     return float(((a - b) / a).abs().max())
 
 
-def test_two_processes_train_as_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("optimizer", "potential"), [("adam", False), pytest.param("muon", True, marks=pytest.mark.slow)]
+)
+def test_two_processes_train_as_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, optimizer: str, potential: bool
+) -> None:
     """Balanced terms, the hardest points only, points where the policy went, added labels, a clipped gradient, L-BFGS.
 
     Seven rows of a stream cannot be shared equally. SOAP is not compared: a gradient that differs by 1e-15 changes its
@@ -105,9 +112,12 @@ def test_two_processes_train_as_one(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     """
     monkeypatch.setattr(AdaptiveLabels, "_solved", fake_round)
     options: dict[str, Any] = {
-        "adaptive": Adaptive(2, labels=6, candidates=16, types=2),
+        "adaptive": Adaptive(1, labels=4, candidates=8, types=2),
+        "validate_every": 25,
+        "optimizer": {"name": optimizer, "lr": 1e-2},
+        "potential": potential,
         "gradient_clip_val": 0.5,
-        "polish": 3,
+        "polish": 2,
     }
     one, alone, found = trained(tmp_path / "one", 1, **options)
     two, operator, again = trained(tmp_path / "two", 2, **options)
@@ -115,7 +125,7 @@ def test_two_processes_train_as_one(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert apart(one.losses, two.losses) < 1e-9
     assert found.metrics == pytest.approx(again.metrics, rel=1e-9)
     assert found.best == pytest.approx(again.best, rel=1e-9)
-    assert [step.labelled for step in found.rounds] == [step.labelled for step in again.rounds] == [6, 6]
+    assert [step.labelled for step in found.rounds] == [step.labelled for step in again.rounds] == [4]
     assert all(map(torch.allclose, alone.state_dict().values(), operator.state_dict().values()))
     assert sorted(path.name for path in (tmp_path / "two").iterdir()) == [BEST, LAST, "previous.ckpt"]
 
