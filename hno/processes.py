@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import threading
@@ -49,8 +50,8 @@ class _State:
     """When it came, s."""
     taken = False
     """Whether signals are this module's."""
-    waits = False
-    """Whether it waits for `stop_if_asked`."""
+    waits: float | None = None
+    """How long it waits for `stop_if_asked`, s; None if it does not."""
     follows = False
     """Whether it ends with its parent."""
     tell: Callable[[int], bool] | None = None
@@ -63,8 +64,8 @@ def _answer(number: int, frame: FrameType | None) -> None:
         return
     if not again:
         _State.number, _State.since = number, time.monotonic()
-        if _State.waits:
-            signal.setitimer(signal.ITIMER_REAL, GRACE)
+        if _State.waits is not None:
+            signal.setitimer(signal.ITIMER_REAL, 0 if _State.waits == math.inf else _State.waits)
             return
         if _State.tell is not None and _State.tell(number):
             return
@@ -75,11 +76,16 @@ def _lose_patience(number: int, frame: FrameType | None) -> None:
     raise Interrupted(_State.number or number)
 
 
-def stop_if_asked() -> None:
-    """Raise `Interrupted` if a signal came; called where nothing is half done."""
-    if _State.number is not None:
+def stop_if_asked(agreed: Callable[[int], int] | None = None) -> None:
+    """Raise `Interrupted` if a signal came; called where nothing is half done.
+
+    Args:
+        agreed: what several processes make of the number of each one's signal, 0 for none.
+    """
+    own = _State.number or 0
+    if number := own if agreed is None else agreed(own):
         signal.setitimer(signal.ITIMER_REAL, 0)
-        raise Interrupted(_State.number, between=True)
+        raise Interrupted(number, between=True)
 
 
 @contextmanager
@@ -131,13 +137,19 @@ def _take_signals() -> None:
 
 
 @contextmanager
-def waiting_signals() -> Iterator[None]:
-    """Let a signal wait for the next `stop_if_asked`, for `GRACE` at most."""
-    _State.waits = True
+def waiting_signals(longest: float = GRACE) -> Iterator[None]:
+    """Let a signal wait for the next `stop_if_asked`, for so long at most, s."""
+    _State.waits = longest
     try:
         yield
     finally:
-        _State.waits = False
+        _State.waits = None
+
+
+def break_off() -> None:
+    """Let `Interrupted` be raised in the main thread, if signals are this module's; called from another thread."""
+    if _State.taken:
+        os.kill(os.getpid(), signal.SIGALRM)
 
 
 @contextmanager

@@ -27,10 +27,11 @@ from hno.operators import Architecture, Choice, ValueOperator, make_operator
 from hno.training.adaptive import Adaptive
 from hno.training.callbacks import callbacks
 from hno.training.checkpoint import Draw, Provenance, check_resumable, record
-from hno.training.fit import Settings
 from hno.training.optimizers import make_optimizer
 from hno.training.quiet import quiet_lightning
-from hno.training.trainer import make_trainer
+from hno.training.ranks import Ranks
+from hno.training.settings import Settings
+from hno.training.trainer import check_devices, make_trainer
 
 
 class Built(NamedTuple):
@@ -62,7 +63,7 @@ def check(config: DictConfig) -> TrainSettings:
             parse_types(game, settings.validation.types, key="validation.types")
         how_to_train(settings)
         make_optimizer(steps=1, **settings.optimizer)
-        _check_device(settings)
+        _check_devices(settings, built)
         if settings.evaluation.ntk:
             check_rows(built.operator, settings.evaluation.ntk_rows)
     if settings.resume is not None and (path := newest(run_folder(settings.resume))):
@@ -70,10 +71,12 @@ def check(config: DictConfig) -> TrainSettings:
     return settings
 
 
-def _check_device(settings: TrainSettings) -> None:
+def _check_devices(settings: TrainSettings, built: Built) -> None:
     try:
         with quiet_lightning():
-            make_trainer(how_to_train(settings), Path(), [], chosen_callbacks(settings))
+            chosen = how_to_train(settings)
+            count = check_devices(chosen, built.objective, built.data)
+            make_trainer(chosen, Path(), [], chosen_callbacks(settings), Ranks(count=count))
     except (MisconfigurationException, TypeError, ImportError) as error:
         raise ValueError(f"trainer.accelerator, trainer.devices or trainer.precision: {error}") from error
 

@@ -113,7 +113,7 @@ def train_operator(settings: TrainSettings, folder: Path, results: Results) -> F
             watching += [Film(folder)] if settings.evaluation.landscape else []
             fitted = fit(
                 operator, objective, data, how_to_train(settings), folder, validation=first, later=later,
-                record=record_of(settings, built), loggers=makers, callbacks=[*chosen, *watching], resume=resume,
+                record=record_of(settings, built), loggers=makers, callbacks=chosen, watching=watching, resume=resume,
             )  # fmt: skip
     except DivergedError:
         if (folder / BEST).exists():

@@ -143,7 +143,7 @@ class GameData(L.LightningDataModule):
 
     def prepare_data(self) -> None:
         """Solve what the cache lacks, if labels are needed."""
-        if self.extremals or not self.needs_labels:
+        if self.extremals or self.labelled is not None or not self.needs_labels:
             return
         plan = self.labels
         arguments = self.game, self.requests, plan.cache or default_cache(), plan.solver, plan.workers, self.report
@@ -159,6 +159,13 @@ class GameData(L.LightningDataModule):
         held_out = [of_starts(found, found.starts - kept) for found, kept in self._split()]
         self.labelled = LabelledRows(self.game, trained, self.potential)
         self.val_rows = self.labelled.of(held_out)
+
+    def for_another_process(self) -> GameData:
+        """A copy that draws the same batches, without the labels that its rows were made of, and without a trainer."""
+        other = copy.copy(self)
+        other.trainer, other.report, other.between = None, None, stop_if_asked
+        other.extremals, other.own = [], []
+        return other
 
     @property
     def train_rows(self) -> Sample | None:
@@ -212,15 +219,14 @@ class GameData(L.LightningDataModule):
             self.labelled.restore(state_dict["added"])
 
     def batch(self, step: int, sizes: Mapping[str, int | None] | None = None) -> Batch:
-        """The batch of one step, a pure function of (seed, step, rank), and of earlier `visits`.
+        """The batch of one step, a pure function of (seed, step), and of earlier `visits`.
 
         Args:
             step: the training step.
             sizes: rows of each stream, `batch_sizes` by default.
         """
         sizes = sizes or self.batch_sizes
-        rank = self.trainer.global_rank if self.trainer is not None else 0
-        generator = torch.Generator().manual_seed(mix(step, self.seed, rank))
+        generator = torch.Generator().manual_seed(mix(step, self.seed, 0))
         batch: Batch = {}
         if "bvp" in self.streams and self.labelled is not None:
             (rows, drawn), size = self.labelled.at(step), sizes["bvp"]

@@ -112,6 +112,10 @@ class Objective(nn.Module):
         """Data streams that the terms that count read. Raises as `used`."""
         return frozenset(term.stream for term in self.used(exact_terminal=exact_terminal).values())
 
+    def kept(self, rows: int) -> int:
+        """How many of so many collocation points count."""
+        return rows if self.hardest == 1 else max(1, round(self.hardest * rows))
+
     def residual(self, name: str, view: View) -> Tensor:
         """Residual of a term, in the size that it states if `scaled`."""
         term = self.terms[name]

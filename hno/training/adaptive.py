@@ -26,7 +26,8 @@ from hno.games import Game
 from hno.pontryagin.online import subgame
 from hno.pontryagin.solve import Solver
 from hno.training.module import TrainingModule
-from hno.types import Extremal, Status, best_of, part
+from hno.training.ranks import Ranks
+from hno.types import Extremal, Sample, Status, best_of, part
 
 log = logging.getLogger(__name__)
 
@@ -114,12 +115,21 @@ class AdaptiveLabels(L.Callback):
         dt: time for which episodes hold a control, s.
         solver: settings of the label solver.
         workers: label processes.
+        ranks: the processes of the training; the first one makes the labels for all.
     """
 
     def __init__(
-        self, plan: Adaptive, steps: int, seed: int, dt: float, solver: Solver = Solver(), workers: int | None = None
+        self,
+        plan: Adaptive,
+        steps: int,
+        seed: int,
+        dt: float,
+        solver: Solver = Solver(),
+        workers: int | None = None,
+        ranks: Ranks = Ranks(),
     ) -> None:
         self.plan, self.seed, self.dt, self.solver, self.workers = plan, seed, dt, solver, workers
+        self.ranks = ranks
         self.due, self.done = plan.steps(steps), list[Round]()
 
     def on_train_batch_end(
@@ -129,14 +139,21 @@ class AdaptiveLabels(L.Callback):
         assert isinstance(pl_module, TrainingModule)
         data = getattr(trainer, "datamodule", None)
         if trainer.global_step in self.due and isinstance(data, GameData):
-            if "bvp" not in data.streams:
+            if data.labelled is None or "bvp" not in data.streams:
                 log.info("no labels are added: no loss term reads them")
                 return
-            found = self.round(Feedback(pl_module.operator, checked=False), data, trainer.global_step)
-            log.info(
-                "round %d: %d of %d episodes collide; %d starts labelled, of which %d inevitable and %d unsolved",
-                len(self.done), found.collided, found.candidates, found.labelled, found.inevitable, found.unsolved,
-            )  # fmt: skip
+            policy, step = Feedback(pl_module.operator, checked=False), trainer.global_step
+            data.labelled.added = self.ranks.told(lambda: self._added(policy, data, step))
+
+    def _added(self, policy: Feedback, data: GameData, step: int) -> list[tuple[int, Sample]]:
+        """What is there to train on besides the first labels, after a round."""
+        found = self.round(policy, data, step)
+        log.info(
+            "round %d: %d of %d episodes collide; %d starts labelled, of which %d inevitable and %d unsolved",
+            len(self.done), found.collided, found.candidates, found.labelled, found.inevitable, found.unsolved,
+        )  # fmt: skip
+        assert data.labelled is not None
+        return data.labelled.added
 
     def round(self, policy: Feedback, data: GameData, step: int) -> Round:
         """Play, choose, label, and extend the data."""

@@ -83,8 +83,8 @@ class StopOnDivergence(L.Callback):
     def diverged(self, trainer: L.Trainer, what: str) -> DivergedError:
         """The error, once the latest batch is in the folder."""
         further = []
-        if self.batches:
-            path = self.folder / (f"{trainer.global_rank}-{BAD_BATCH}" if trainer.global_rank else BAD_BATCH)
+        if self.batches and trainer.global_rank == 0:  # which all ranks know whole
+            path = self.folder / BAD_BATCH
             try:
                 write_batch(path, self.batches[-1])
                 further.append(f"The batch of that step is in {path}.")

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import lightning as L
 from lightning.pytorch.loggers import Logger
+from lightning.pytorch.loggers.logger import DummyLogger
 
 from hno.data import GameData
 from hno.data.certificates import safe_sets
@@ -17,7 +19,7 @@ from hno.data.folders import check_room
 from hno.losses import Objective, Scales
 from hno.operators import ValueOperator
 from hno.processes import stop_if_asked, waiting_signals
-from hno.training.adaptive import Adaptive, AdaptiveLabels, Round
+from hno.training.adaptive import AdaptiveLabels, Round
 from hno.training.checkpoint import check_training_state, same_run
 from hno.training.interruption import SaveOnSignal
 from hno.training.logbook import Logbook
@@ -25,67 +27,15 @@ from hno.training.module import TrainingModule
 from hno.training.optimizers import make_optimizer
 from hno.training.polish import Polish
 from hno.training.quiet import quiet_lightning
+from hno.training.ranks import Ranks
 from hno.training.saving import BEST, LAST, UNFIT, CheckpointError, read_content, reason, remove_drafts
-from hno.training.trainer import make_trainer
+from hno.training.settings import LONG, Settings
+from hno.training.together import together
+from hno.training.trainer import check_devices, make_trainer
 from hno.training.validation import ClosedLoopValidation, Later, Score
 from hno.types import Extremal
 
 log = logging.getLogger(__name__)
-
-PRECISIONS = ("32-true", "32")
-"""Precisions of Lightning in which a training is sound. The others move the game, its simulation and the scales to 16
-or 64 bits, or compute residuals in 16; the step gains nothing by them, since derivatives are taken in 32 anyway."""
-LONG = 20_000
-"""Steps from which on compiling pays: it takes some ten seconds and saves about a millisecond a step."""
-
-
-@dataclass(frozen=True)
-class Settings:
-    """How an operator is trained: a field for every choice, all with defaults."""
-
-    steps: int = 2000
-    schedule_steps: int | None = None
-    """Steps over which the rate falls and labels are added; `steps` by default. Those beyond keep the final rate."""
-    optimizer: Mapping[str, Any] = field(default_factory=lambda: {"name": "soap"})
-    """Name and options, see `hno.training.optimizers.make_optimizer`."""
-    validate_every: int = 500
-    """Steps between validations and checkpoints."""
-    stop_when_safe: bool = False
-    """End the training as soon as no validation start collides."""
-    dt: float = 0.02
-    """Time for which validation episodes hold a control, s."""
-    accelerator: str = "auto"
-    devices: int | str | list[int] = 1
-    """One device: 1, or its number in a list."""
-    precision: Any = "32-true"
-    """One of `PRECISIONS`."""
-    gradient_clip_val: float | None = None
-    strategy: str = "auto"
-    """"auto" or "single_device"."""
-    profiler: str | None = None
-    """"simple", "advanced" or "pytorch"; it writes into the folder."""
-    lightning: Mapping[str, Any] = field(default_factory=dict)
-    """Further arguments of Lightning's trainer, see `hno.training.trainer.CONTROLLED` for those that are none."""
-    polish: int = 0
-    """Iterations of L-BFGS on all labelled rows after the last step."""
-    adaptive: Adaptive = field(default_factory=Adaptive)
-    """Labels that are added while training."""
-    compile: bool = True
-    """`torch.compile` in runs of at least `LONG` steps."""
-
-    @property
-    def planned(self) -> int:
-        """Steps over which everything that changes with them is laid out."""
-        return self.schedule_steps or self.steps
-
-    def __post_init__(self) -> None:
-        """Refuse, with a ValueError, a precision in which simulation and residuals would be wrong."""
-        if str(self.precision) not in PRECISIONS:
-            raise ValueError(
-                f"trainer.precision must be {PRECISIONS[0]}; got {self.precision!r}. Others would compute residuals or "
-                "move the game and its simulation in 16 or 64 bits."
-            )
-
 
 _LEARNED = {False: "the players' values", True: "a potential"}
 
@@ -107,6 +57,63 @@ class Fitted(NamedTuple):
     this one goes on from too."""
 
 
+@dataclass(frozen=True)
+class _Training:
+    """What every process of a training knows."""
+
+    operator: ValueOperator
+    objective: Objective
+    data: GameData
+    settings: Settings
+    folder: Path
+    validation: Sequence[Extremal]
+    record: Mapping[str, Any] | None
+    callbacks: Sequence[L.Callback]
+    resume: Path | None
+    best_too: bool
+    """Whether the best checkpoint in the folder is of the run that goes on."""
+
+    @quiet_lightning()
+    def run(
+        self,
+        ranks: Ranks,
+        loggers: Sequence[Logger],
+        watching: Sequence[L.Callback] = (),
+        later: Later | None = None,
+    ) -> Fitted:
+        """Train, as one of the processes."""
+        settings, data, folder, plan = self.settings, self.data, self.folder, self.data.labels
+        optimizer = make_optimizer(steps=settings.planned, **settings.optimizer)
+        module = TrainingModule(self.operator, self.objective, optimizer, self.record, ranks)
+        if settings.compile and settings.planned >= LONG:
+            self.operator.compile_kernels()
+        every, dt = settings.validate_every, settings.dt
+        watch = ClosedLoopValidation(folder, every, dt=dt, stop=settings.stop_when_safe, ranks=ranks)
+        watch.begin(self.validation, later)
+        watch.resumes = self.best_too
+        adding = AdaptiveLabels(settings.adaptive, settings.planned, data.seed, dt, plan.solver, plan.workers, ranks)
+        logbook = Logbook()
+        guard = SaveOnSignal(folder, lambda step: step in adding.due or watch.due(step, settings.steps), ranks)
+        own = [guard, adding, watch, Polish(settings.polish, watch), logbook]
+        trainer = make_trainer(settings, folder, loggers, [*own, *self.callbacks, *watching], ranks)
+        try:
+            trainer.fit(module, datamodule=data, ckpt_path=self.resume, weights_only=True)
+        except UNFIT as error:
+            if self.resume is None or module.began:
+                raise
+            raise CheckpointError(f"{self.resume} does not fit this run: {reason(error)}") from error
+        added = sum(found.seconds for found in adding.done)
+        training = logbook.seconds - watch.seconds - added
+        seconds = {"training": training, "validation": watch.seconds - watch.solving}
+        seconds |= {"added_labels": added} if adding.done else {}
+        checkpoint = folder / (LAST if watch.best is None else BEST)  # a best one of another run does not count
+        return Fitted(trainer, checkpoint, logbook.metrics, watch.best, adding.done, seconds)
+
+    def follow(self, ranks: Ranks, logged: bool) -> None:
+        """Train as one of the others: nothing is written, and callbacks have a logger where there is one elsewhere."""
+        self.run(ranks, [DummyLogger()] if logged else [])
+
+
 @quiet_lightning()
 def fit(
     operator: ValueOperator,
@@ -120,9 +127,12 @@ def fit(
     record: Mapping[str, Any] | None = None,
     loggers: Sequence[Logger] = (),
     callbacks: Sequence[L.Callback] = (),
+    watching: Sequence[L.Callback] = (),
     resume: Path | None = None,
 ) -> Fitted:
     """Train an operator; the folder gets `last.ckpt`, `previous.ckpt` and, with closed-loop validation, `best.ckpt`.
+
+    Where there are several devices this process uses the first one and starts another process for each of the others.
 
     Args:
         operator: changed in place.
@@ -136,11 +146,13 @@ def fit(
         record: entries of checkpoints besides the weights, see `hno.training.checkpoint.record`.
         loggers: of Lightning.
         callbacks: of Lightning, besides those that watch the run.
+        watching: callbacks that look on, in this process alone.
         resume: a checkpoint of the same run to go on from.
 
     Raises:
         DivergedError: the loss, a gradient, a weight, or the error on held-out labels is no longer sound.
         CheckpointError: the training cannot go on from the checkpoint.
+        RankError: the process of another device failed.
         OSError: the checkpoints do not fit into the folder.
     """
     if data.potential != operator.potential:
@@ -148,39 +160,26 @@ def fit(
             f"The operator learns {_LEARNED[operator.potential]}, the data label {_LEARNED[data.potential]}: make them "
             "alike with GameData(potential=operator.potential)."
         )
-    optimizer = make_optimizer(steps=settings.planned, **settings.optimizer)
-    module = TrainingModule(operator, objective, optimizer, record)
-    if settings.compile and settings.planned >= LONG:
-        operator.compile_kernels()
+    count = check_devices(settings, objective, data)
+    make_optimizer(steps=settings.planned, **settings.optimizer)
+    settings.adaptive.steps(settings.planned)
     data.setup("fit")
     _learn_sizes(operator, objective, data)
-    watch = ClosedLoopValidation(folder, settings.validate_every, dt=settings.dt, stop=settings.stop_when_safe)
-    watch.begin(safe_sets(data.held_out()) if validation is None else validation, later)
-    plan = data.labels
-    adding = AdaptiveLabels(settings.adaptive, settings.planned, data.seed, settings.dt, plan.solver, plan.workers)
-    logbook = Logbook()
-    guard = SaveOnSignal(folder, lambda step: step in adding.due or watch.due(step, settings.steps))
-    own = [guard, adding, watch, Polish(settings.polish, watch), logbook]
-    trainer = make_trainer(settings, folder, loggers, [*own, *callbacks])
+    if validation is None:
+        validation = safe_sets(data.held_out())
     remove_drafts(folder)
     if resume is not None:
         check_training_state(resume, read_content(resume), settings.steps)
-        watch.resumes = same_run(folder / BEST, resume)
+    best_too = resume is None or same_run(folder / BEST, resume)
     _check_room(folder, operator)
-    try:
-        with waiting_signals():
-            trainer.fit(module, datamodule=data, ckpt_path=resume, weights_only=True)
-    except UNFIT as error:
-        if resume is None or module.began:
-            raise
-        raise CheckpointError(f"{resume} does not fit this run: {reason(error)}") from error
+    training = _Training(
+        operator, objective, data, settings, folder, validation, record, callbacks, resume, best_too
+    )  # fmt: skip
+    theirs = replace(training, data=data.for_another_process(), settings=replace(settings, profiler=None))
+    with waiting_signals(), together(count, partial(theirs.follow, logged=bool(loggers))) as ranks:
+        fitted = training.run(ranks, loggers, watching, later)
     stop_if_asked()
-    added = sum(found.seconds for found in adding.done)
-    training = logbook.seconds - watch.seconds - added
-    seconds = {"training": training, "validation": watch.seconds - watch.solving}
-    seconds |= {"added_labels": added} if adding.done else {}
-    checkpoint = folder / (LAST if watch.best is None else BEST)  # a best one of another run does not count
-    return Fitted(trainer, checkpoint, logbook.metrics, watch.best, adding.done, seconds)
+    return fitted
 
 
 def _learn_sizes(operator: ValueOperator, objective: Objective, data: GameData) -> None:

@@ -10,6 +10,7 @@ import lightning as L
 
 from hno.data import GameData
 from hno.processes import Interrupted, stop_if_asked, take_back_signals
+from hno.training.ranks import Ranks
 from hno.training.saving import LAST
 
 
@@ -21,10 +22,11 @@ class SaveOnSignal(L.Callback):
     Args:
         folder: of the run.
         long: whether long work follows a step, by its number.
+        ranks: the processes of the training; a signal to any of them ends all after the same step.
     """
 
-    def __init__(self, folder: Path, long: Callable[[int], bool]) -> None:
-        self.path, self.long, self.saved = folder / LAST, long, 0
+    def __init__(self, folder: Path, long: Callable[[int], bool], ranks: Ranks = Ranks()) -> None:
+        self.path, self.long, self.ranks, self.saved = folder / LAST, long, ranks, 0
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Take signals back from Lightning, which ends trainings without a checkpoint."""
@@ -38,7 +40,7 @@ class SaveOnSignal(L.Callback):
 
     def between(self, trainer: L.Trainer) -> None:
         """Save what would take long to come to again; the step before is complete, its losses are logged."""
-        stop_if_asked()
+        stop_if_asked(self.ranks.largest)
         if trainer.global_step > self.saved and self.long(trainer.global_step + 1):
             self._save(trainer)
 

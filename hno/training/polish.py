@@ -67,6 +67,7 @@ def polish(module: TrainingModule, batch: Batch, iterations: int) -> tuple[float
         total = module.objective.total(module.losses(batch))
         if torch.is_grad_enabled():
             total.backward()
+            module.ranks.add_gradients(operator.parameters())
         return total.detach()
 
     with torch.no_grad():

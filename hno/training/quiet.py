@@ -12,6 +12,8 @@ EXPECTED = (
     ".*isinstance.treespec, LeafSpec.",  # Lightning's own, from torch 2.13 on
     ".*does not have many workers",  # batches are made in memory
     ".*dirpath has changed",  # a run goes on in another folder
+    ".*`srun` command is available",  # every process is there already
+    ".*sync_dist=True",  # what is logged is of the whole batch, the same in every process
 )
 """Warnings of Lightning that mean nothing here."""
 

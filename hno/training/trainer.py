@@ -5,25 +5,26 @@ from __future__ import annotations
 import inspect
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import lightning as L
 from lightning.pytorch.callbacks import ModelCheckpoint, ProgressBar
 from lightning.pytorch.loggers import Logger
 from lightning.pytorch.profilers import AdvancedProfiler, Profiler, PyTorchProfiler, SimpleProfiler
 
+from hno.data import GameData
+from hno.losses import Objective
 from hno.registry import UnknownNameError, unknown_name
 from hno.training.divergence import StopOnDivergence
+from hno.training.ranks import Here, Ranks, Together
 from hno.training.saving import LAST, CheckpointFiles
-
-if TYPE_CHECKING:
-    from hno.training.fit import Settings
+from hno.training.settings import Settings
 
 PROFILERS: Mapping[str, type[Profiler]] = {
     "simple": SimpleProfiler, "advanced": AdvancedProfiler, "pytorch": PyTorchProfiler,
 }  # fmt: skip
 """Each writes a file, or files, named profile into the run's folder."""
-STRATEGIES = ("auto", "single_device")
+STRATEGIES = ("auto", "single_device", "ddp")
 _STEPS = "a training counts steps: trainer.max_steps and trainer.validate_every"
 _BATCHES = "every batch is a function of seed and step: choose data.batch_sizes"
 _NO_TEST = "a trainer of ours only fits; the evaluation is under `evaluation`"
@@ -43,6 +44,8 @@ CONTROLLED: Mapping[str, str] = {
     "limit_test_batches": _NO_TEST,
     "limit_predict_batches": _NO_TEST,
     "accumulate_grad_batches": _BATCHES,
+    "use_distributed_sampler": "every device takes its share of every batch",
+    "num_nodes": "a run trains on one machine: give each a run of its own, with launcher=slurm or ray",
     "reload_dataloaders_every_n_epochs": _BATCHES,
     "enable_checkpointing": "checkpoints are what a run goes on from and is judged by",
     "enable_progress_bar": "there is one on a terminal, and lines elsewhere: trainer.print_every",
@@ -88,19 +91,65 @@ def profiler(name: str | None, folder: Path) -> Profiler | None:
     return PROFILERS[name](dirpath=folder, filename="profile")
 
 
+def device_count(settings: Settings) -> int:
+    """How many devices a training asks for.
+
+    Raises:
+        ValueError: there is no such accelerator, or `single_device` is to be several.
+    """
+    found = L.Trainer(
+        accelerator=settings.accelerator, devices=settings.devices, logger=False, enable_checkpointing=False,
+        enable_progress_bar=False, enable_model_summary=False, plugins=[Here()],
+    ).num_devices  # fmt: skip
+    if found > 1 and settings.strategy == "single_device":
+        raise ValueError(
+            f"trainer.devices={settings.devices} asks for {found} devices, trainer.strategy=single_device for one: "
+            "take trainer.strategy=ddp, or trainer.devices=1."
+        )
+    return found
+
+
+def check_devices(settings: Settings, objective: Objective, data: GameData) -> int:
+    """How many devices a training asks for.
+
+    Raises:
+        ValueError: there are none such, or more than a step has rows for.
+    """
+    count = device_count(settings)
+    for name in sorted(data.streams):
+        size = data.batch_sizes[name]
+        rows = size if size is None or name != "interior" else objective.kept(size)
+        if rows is not None and rows < count:
+            raise ValueError(
+                f"trainer.devices={settings.devices} asks for {count} devices, but a step has {rows} rows of "
+                f"data.batch_sizes.{name}: take at least one row for each, or fewer devices."
+            )
+    return count
+
+
 def make_trainer(
-    settings: Settings, folder: Path, loggers: Sequence[Logger], callbacks: Sequence[L.Callback]
+    settings: Settings,
+    folder: Path,
+    loggers: Sequence[Logger],
+    callbacks: Sequence[L.Callback],
+    ranks: Ranks = Ranks(),
 ) -> L.Trainer:
     """A trainer that runs for a number of steps and leaves `last.ckpt`, of what is validated every so often.
 
+    Args:
+        settings: how to train.
+        folder: where checkpoints go.
+        loggers: of Lightning.
+        callbacks: of Lightning.
+        ranks: the place of this process among those of the training; there are as many as devices.
+
     Raises:
-        ValueError: there is no such accelerator, precision, profiler or argument, or there are several devices.
+        ValueError: there is no such accelerator, precision, profiler or argument.
     """
     check_arguments(settings.lightning)
     if settings.strategy not in STRATEGIES:
         raise ValueError(
-            f"trainer.strategy must be {' or '.join(STRATEGIES)}; got {settings.strategy!r}: a run trains on one "
-            "device. Put several to use with one run on each."
+            f"trainer.strategy must be {', '.join(STRATEGIES)}; got {settings.strategy!r}. Others part what is small."
         )
     every, files = settings.validate_every, CheckpointFiles()
     # After a validation, when the step is over and in the curves: what goes on from there lacks and repeats nothing.
@@ -108,9 +157,9 @@ def make_trainer(
         folder, Path(LAST).stem, every_n_epochs=1, save_on_train_epoch_end=False, enable_version_counter=False
     )
     free = {"log_every_n_steps": max(1, min(50, settings.planned)), "enable_model_summary": False, **settings.lightning}
-    trainer = L.Trainer(
+    return L.Trainer(
         accelerator=settings.accelerator,
-        strategy=settings.strategy,
+        strategy="auto" if ranks.count == 1 else Together(ranks),
         devices=settings.devices,
         precision=settings.precision,
         max_steps=settings.steps,
@@ -121,16 +170,11 @@ def make_trainer(
         num_sanity_val_steps=0,
         logger=list(loggers) or False,
         callbacks=[StopOnDivergence(folder, files), *callbacks, keeping_last],
-        plugins=[files],
+        plugins=[files, *([Here()] if ranks.count == 1 else [])],
         profiler=profiler(settings.profiler, folder),
         enable_progress_bar=any(isinstance(callback, ProgressBar) for callback in callbacks),
         default_root_dir=folder,
         inference_mode=False,
+        use_distributed_sampler=False,
         **free,
     )
-    if trainer.world_size > 1:
-        raise ValueError(
-            f"trainer.devices={settings.devices} asks for {trainer.world_size} devices; a run trains on one. Choose it "
-            "with trainer.devices=1 or its number, [1], and put several devices to use with one run on each."
-        )
-    return trainer

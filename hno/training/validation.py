@@ -16,6 +16,7 @@ from hno.control.policy import Feedback
 from hno.control.rollout import rollout
 from hno.data import GameData
 from hno.training.module import TrainingModule
+from hno.training.ranks import Ranks
 from hno.training.saving import BEST
 from hno.types import Extremal, Trajectory, join, part
 
@@ -87,10 +88,20 @@ class ClosedLoopValidation(L.Callback):
         probe: starts per type that are played first.
         dt: time for which a control is held, s.
         stop: whether to end the training as soon as no start collides.
+        ranks: the processes of the training; the first one plays and tells the others.
     """
 
-    def __init__(self, folder: Path, every: int, probe: int = PROBE, dt: float = 0.02, stop: bool = False) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        every: int,
+        probe: int = PROBE,
+        dt: float = 0.02,
+        stop: bool = False,
+        ranks: Ranks = Ranks(),
+    ) -> None:
         self.path, self.every, self.count, self.dt, self.stop = folder / BEST, every, probe, dt, stop
+        self.ranks = ranks
         self.all: Starts | None = None
         self.later: Later | None = None
         self.best: Score | None = None
@@ -140,8 +151,10 @@ class ClosedLoopValidation(L.Callback):
         """Play, if there are starts, and write `best.ckpt` if nothing was better so far."""
         if self.all is None:
             return None
-        began = time.perf_counter()
-        found = self.play(trainer, module, self.all)
+        began, starts, data = time.perf_counter(), self.all, getattr(trainer, "datamodule", None)
+        found, visits = self.ranks.told(lambda: (self.play(trainer, module, starts), getattr(data, "visits", [])))
+        if isinstance(data, GameData):
+            data.visits = visits
         if better := found.after(self.best):
             self.best = better
             trainer.save_checkpoint(self.path, weights_only=False)

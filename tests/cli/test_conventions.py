@@ -20,7 +20,7 @@ from hno.cli.objective import objective
 from hno.cli.resume import training_hash
 from hno.cli.settings import COMMANDS, TrainSettings
 from hno.training.callbacks import callbacks
-from hno.training.fit import Settings
+from hno.training.settings import Settings
 from hno.training.trainer import CONTROLLED, OWN, PROFILERS, make_trainer
 from tests.cli.conftest import SMOKE, Command, refused
 from tests.cli.test_configs import composed
@@ -53,7 +53,7 @@ def test_arguments_of_the_trainer_reach_it() -> None:
     [
         ("+trainer.fast_dev_run=true", ["trainer.fast_dev_run", "debug=fast"]),
         ("trainer.max_epochs=3", ["trainer.max_epochs", "trainer.max_steps"]),
-        ("trainer.strategy=ddp", ["trainer.strategy must be auto or single_device", "one device"]),
+        ("trainer.strategy=fsdp", ["trainer.strategy must be auto, single_device, ddp; got 'fsdp'"]),
         ("trainer.min_step=3", ["trainer.min_step does not exist", "Did you mean 'min_steps'"]),
         ("+evaluation.robustness=true", ["evaluation.robustness does not exist"]),
         ("callbacks.early_stoping={}", ["callbacks.early_stoping does not exist", "'early_stopping'"]),

@@ -50,15 +50,23 @@ def test_batch_leaves_the_global_generator_alone(make_data: MakeData) -> None:
     assert torch.equal(torch.random.get_rng_state(), before)
 
 
-def test_batches_differ_between_steps_seeds_and_ranks(make_data: MakeData) -> None:
+def test_batches_differ_between_steps_and_seeds(make_data: MakeData) -> None:
     data, other = make_data(seed=0), make_data(seed=1)
     here, later, elsewhere = data.batch(10), data.batch(11), other.batch(10)
-    data.trainer = SimpleNamespace(global_rank=1, global_step=0)
-    second_rank = data.batch(10)
-    for different in (later, elsewhere, second_rank):
+    for different in (later, elsewhere):
         for name in here:
             assert not torch.equal(here[name].points.x, different[name].points.x)
         assert not any_equal_rows(here["interior"].points.x, different["interior"].points.x)
+
+
+def test_another_process_draws_the_same_batches_without_labels_of_its_own(make_data: MakeData) -> None:
+    data = make_data()
+    data.trainer = SimpleNamespace(global_rank=1, global_step=0)
+    other = data.for_another_process()
+    assert (other.trainer, other.extremals) == (None, [])
+    other.setup("fit")
+    assert equal(data.batch(10), other.batch(10))
+    assert data.extremals, "this one keeps them"
 
 
 @pytest.mark.parametrize("period", [2**10, 2**12, 2**16, 2**20, 300_000])

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from hno.training.fit import Settings
+from hno.training.settings import Settings
 
 WRONG = ("bf16-true", "16-true", "64-true", "8", "transformer-engine", "bf16-mixed", "16-mixed", "64", "bf16", "half")
 
