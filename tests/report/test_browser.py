@@ -141,9 +141,9 @@ def test_what_is_learned_is_a_filter_of_its_own(context, tmp_path):
 
 
 def test_a_seed_shows_single_runs_in_place_of_pooled_ones(browser):
-    pooled = browser.page.locator(".map:visible").first.inner_text()
+    pooled = browser.page.locator(".map:visible").first.text_content()
     browser.filter(seed="0", game="narrow_road")
-    assert "seed 0" in browser.page.locator(".map:visible").first.inner_text()
+    assert "seed 0" in browser.page.locator(".map:visible").first.text_content()
     assert "seed 0" not in pooled
 
 
@@ -197,7 +197,7 @@ def move_to(page, time: float) -> None:
 
 
 def titles(page) -> list[str]:
-    return page.locator("#episode option").all_inner_texts()
+    return page.locator("#episode option").all_text_contents()
 
 
 def test_discs_are_red_exactly_in_a_collision(browser):
