@@ -51,8 +51,8 @@ class _State:
     """Whether signals are this module's."""
     waits = False
     """Whether it waits for `stop_if_asked`."""
-    follows = False
-    """Whether it ends with its parent."""
+    follows: int | None = None
+    """The parent that it ends with."""
     tell: Callable[[int], bool] | None = None
     """Passes a signal on to other processes; whether any of them is to end first."""
 
@@ -172,8 +172,8 @@ def follow(parent: int) -> None:
     Args:
         parent: the id of the process that work is done for; nothing happens where another one started this.
     """
-    if os.getppid() == parent and not _State.follows:
-        _State.follows = True
+    if os.getppid() == parent and _State.follows is None:
+        _State.follows = parent
 
         def orphaned() -> None:
             os.kill(os.getpid(), signal.SIGTERM)
@@ -181,6 +181,11 @@ def follow(parent: int) -> None:
             os._exit(1)  # workers of a pool would wait for more to do
 
         _watch(parent, orphaned)
+
+
+def forsaken() -> bool:
+    """Whether this process follows one that is gone."""
+    return _State.follows not in (None, os.getppid())
 
 
 def _watch(parent: int, orphaned: Callable[[], None]) -> None:
