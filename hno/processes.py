@@ -10,8 +10,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1") if hasattr(signal, name)]
-"""Those that ask a process to end; Slurm sends SIGTERM, or SIGUSR1 where it is told to, before it takes a node back."""
+NAMES = "SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1", "SIGUSR2"
+SIGNALS = [getattr(signal, name) for name in NAMES if hasattr(signal, name)]
+"""Those that ask a process to end.
+
+Slurm sends SIGTERM, or what it is told to, before it takes a node back: submitit tells it SIGUSR2.
+"""
 GRACE = 5.0
 """Time that a step under way has to come to its end, s."""
 SAME = 1.0

@@ -131,7 +131,7 @@ def _key(word: str) -> str:
 
 def _identifies(word: str) -> bool:
     key = _key(word)
-    return key not in (*HERE, *OTHERS, "sweep") and not key.startswith("hydra.launcher.")
+    return key not in (*HERE, *OTHERS, "launcher", "sweep") and not key.startswith(("hydra.launcher.", "launcher."))
 
 
 def planned(folder: Path, settings: Settings, reads: Sequence[Path] = ()) -> str:

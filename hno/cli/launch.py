@@ -7,23 +7,24 @@ import os
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from hno.cli import again, pages
 from hno.cli.arguments import Arguments, UsageError, one_screen, quoted
 from hno.cli.config import REFUSALS, configured, for_hydra, groups, register_plugins, sentence, under_hydra
+from hno.cli.launchers import check_cluster, keep_to, share, spelled
 from hno.cli.objective import Objective, objective
 from hno.cli.output import fresh, owned
 from hno.cli.perform import Task, perform
 from hno.cli.results import Results
 from hno.cli.schema import REGISTRIES
 from hno.cli.sweep import Entry, Job, Ledger, show_jobs
-from hno.cli.swept import named, swept_keys
+from hno.cli.swept import folders_named
 from hno.data.folders import LOCK, held
 from hno.evaluation.format import NAMES, counted
 from hno.processes import Interrupted, follow, forsaken, interruptible, passed_on
@@ -52,6 +53,7 @@ def run(task: Task, given: Arguments) -> int:
         Interrupted: a signal ended it.
     """
     given, before = again.going_on(given)
+    given = spelled(given)
     if "--multirun" in given.flags:
         return _multirun(task, given, before)
     settings = configured(task.name, task.check, given)
@@ -105,7 +107,8 @@ def _multirun(task: Task, given: Arguments, before: Path | None) -> int:
     dry = "--dry-run" in given.flags
     try:
         words = for_hydra(task.name, given)
-        words = [*words, *_named(task, words)]
+        words, cores = [*words, *folders_named(words, groups(task.name))], share()
+        check_cluster()
         if before is not None:
             again.check_same(before, task.name, words)
         register_plugins()
@@ -116,20 +119,9 @@ def _multirun(task: Task, given: Arguments, before: Path | None) -> int:
             if not dry:
                 print(f"Sweep: {folder}", flush=True)
             words = ["--multirun", *words, f"hydra.sweep.dir={quoted(str(folder))}"]
-            return _swept(task, words, folder, before, dry)
+            return _swept(task, words, Ledger.within(folder, before, cores), dry)
     except REFUSALS as error:
         raise _refusal(error) from error
-
-
-def _named(task: Task, words: Sequence[str]) -> list[str]:
-    """Name the folders of jobs by what was swept, unless the command line names them."""
-    if any(word.lstrip("+").startswith("hydra.sweep.subdir=") for word in words):
-        return []
-    hydra = HydraConfig.get()
-    sweep: Any = OmegaConf.to_container(hydra.sweep)  # as it is written, with its interpolations
-    keys = swept_keys(words, hydra.sweeper.get("params") or {})
-    folder = quoted(named(str(sweep["subdir"]), keys, groups(task.name)))
-    return [f"hydra.sweep.subdir={folder}"] if keys else []
 
 
 def _here(words: Sequence[str]) -> list[str]:
@@ -137,13 +129,15 @@ def _here(words: Sequence[str]) -> list[str]:
     return [word for word in words if not word.lstrip("+").startswith(("hydra/launcher", "hydra.launcher"))]
 
 
-def _swept(task: Task, words: Sequence[str], folder: Path, before: Path | None, dry: bool) -> int:
+def _swept(task: Task, words: Sequence[str], made: AbstractContextManager[Ledger], dry: bool) -> int:
     own = {kind: registry().own() for kind, registry in REGISTRIES.items()}
-    failure, command = None, again.command(task.name, folder)
-    with Ledger.within(folder, before) as ledger:
+    failure = None
+    with made as ledger:
+        command = again.command(task.name, ledger.sweep)
 
         def job(config: DictConfig) -> Objective:  # a launcher may send it to another process
             follow(ledger.process)
+            keep_to(ledger.cores)
             return _job(task, config, ledger, own, dry)
 
         try:
@@ -178,12 +172,16 @@ def _job(task: Task, config: DictConfig, ledger: Ledger, own: Parts, dry: bool) 
         for name, part in parts.items():
             REGISTRIES[kind]().register(name)(part)
     current = Job.current()
+    restarted = ledger.knows(current)
     ledger.write(Entry.begun(current))
     if dry:
         print(f"{current.number}: {' '.join(current.settings)}")
     try:
         settings = task.check(config)
-        found = _foreseen(task, settings, current, ledger) if dry else _performed(task, config, current, ledger)
+        if dry:
+            found = _foreseen(task, settings, current, ledger)
+        else:
+            found = _performed(task, config, current, ledger, restarted)
     except Exception as error:
         print(f"   refused: {one_screen(sentence(error))}") if dry else _refuse(current, error, ledger)
         return None
@@ -202,10 +200,18 @@ def _foreseen(task: Task, settings: Any, job: Job, ledger: Ledger) -> Entry:
     return Entry(job, succeeded=True)
 
 
-def _performed(task: Task, config: DictConfig, job: Job, ledger: Ledger) -> Entry:
-    """Do a job in its folder, or what is left of it; a signal ends the sweep, if it is not this job's process alone."""
-    settings, there = task.check(config), ledger.there(job)
-    goes_on = there is not None and (job.folder / RESULTS).exists()
+def _performed(task: Task, config: DictConfig, job: Job, ledger: Ledger, restarted: bool) -> Entry:
+    """Do a job in its folder, or what is left of it; a signal ends the sweep, if it is not this job's process alone.
+
+    Args:
+        task: of the job.
+        config: of the job.
+        job: it.
+        ledger: of the sweep.
+        restarted: whether it began in this sweep already: a cluster begins it again where a node fails.
+    """
+    settings = task.check(config)
+    goes_on = (ledger.before is not None or restarted) and (job.folder / RESULTS).exists()
     try:
         with interruptible(), owned(job.folder, str(job.folder) if goes_on else getattr(settings, "resume", None)):
             if goes_on:

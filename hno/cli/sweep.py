@@ -100,22 +100,28 @@ class Ledger(NamedTuple):
     """The folder of the sweep."""
     before: Path | None
     """The folder in which the sweep began, where it is run again."""
+    cores: int | None
+    """Of each job; None for all."""
     process: int
     """Of the sweep."""
 
     @classmethod
     @contextmanager
-    def within(cls, sweep: Path, before: Path | None = None) -> Iterator[Ledger]:
+    def within(cls, sweep: Path, before: Path | None = None, cores: int | None = None) -> Iterator[Ledger]:
         """A new ledger in the folder of a sweep, which is gone afterwards, as are those of sweeps that were killed."""
         sweep.mkdir(parents=True, exist_ok=True)
         for old in sweep.glob(f"{PREFIX}*"):
             shutil.rmtree(old, ignore_errors=True)
         with tempfile.TemporaryDirectory(prefix=PREFIX, dir=sweep, ignore_cleanup_errors=True) as folder:
-            yield cls(Path(folder), sweep, before, os.getpid())
+            yield cls(Path(folder), sweep, before, cores, os.getpid())
 
     def there(self, job: Job) -> Path | None:
         """The folder in which a job began before, or would have; None where the sweep is not run again."""
         return None if self.before is None else self.before / job.folder.relative_to(self.sweep)
+
+    def knows(self, job: Job) -> bool:
+        """Whether a job has begun."""
+        return (self.folder / f"{job.number}.json").exists()
 
     def write(self, entry: Entry) -> None:
         """Add a job, or replace its entry."""
