@@ -15,7 +15,8 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
 from hno.cli.arguments import Arguments
-from hno.cli.config import choices, compose, config_dir, for_hydra, groups
+from hno.cli.config import compose, for_hydra
+from hno.cli.confs import choices, config_dir, groups
 from hno.cli.launchers import LAUNCHERS, installed
 from hno.cli.schema import SettingsError
 

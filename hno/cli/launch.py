@@ -16,7 +16,8 @@ from omegaconf import DictConfig
 
 from hno.cli import again, pages
 from hno.cli.arguments import Arguments, UsageError, one_screen, quoted
-from hno.cli.config import REFUSALS, configured, for_hydra, groups, register_plugins, sentence, under_hydra
+from hno.cli.config import REFUSALS, configured, for_hydra, register_plugins, sentence, under_hydra
+from hno.cli.confs import groups
 from hno.cli.launchers import check_cluster, keep_to, share, spelled
 from hno.cli.objective import Objective, objective
 from hno.cli.output import fresh, owned
