@@ -18,7 +18,7 @@ from hno.cli import again, pages
 from hno.cli.arguments import Arguments, UsageError, one_screen, quoted
 from hno.cli.config import REFUSALS, configured, for_hydra, register_plugins, sentence, under_hydra
 from hno.cli.confs import groups
-from hno.cli.launchers import check_cluster, keep_to, share, spelled
+from hno.cli.launchers import check_cluster, in_queue, keep_to, share, spelled
 from hno.cli.objective import Objective, objective
 from hno.cli.output import fresh, owned
 from hno.cli.perform import Task, perform
@@ -132,7 +132,7 @@ def _here(words: Sequence[str]) -> list[str]:
 
 def _swept(task: Task, words: Sequence[str], made: AbstractContextManager[Ledger], dry: bool) -> int:
     own = {kind: registry().own() for kind, registry in REGISTRIES.items()}
-    failure = None
+    failure, queued = None, in_queue()
     with made as ledger:
         command = again.command(task.name, ledger.sweep)
 
@@ -148,6 +148,8 @@ def _swept(task: Task, words: Sequence[str], made: AbstractContextManager[Ledger
             if isinstance(error, REFUSALS) and not ledger.entries():
                 raise
             failure = error
+            if queued:
+                ledger.leave()
         finally:
             found = ledger.entries()
             if found and not dry:
@@ -161,7 +163,8 @@ def _swept(task: Task, words: Sequence[str], made: AbstractContextManager[Ledger
     if dry:
         print(counted(len(found), "job") + (f", {refused} refused" if refused else ""))
     if failure is not None:
-        print(f"The launcher ended before all jobs did: {one_screen(sentence(failure))}", file=sys.stderr)
+        on = " Those that are in the queue go on without it." if queued else ""
+        print(f"The launcher ended before all jobs did: {one_screen(sentence(failure))}{on}", file=sys.stderr)
     return 1 if refused or failure is not None else 0
 
 

@@ -81,7 +81,7 @@ def check_cluster() -> None:
     Raises:
         UsageError: with the reason.
     """
-    if HydraConfig.get().runtime.choices.get("hydra/launcher") != LAUNCHERS["slurm"].choice:
+    if not in_queue():
         return
     advice = "Start the sweep where `sinfo` shows the cluster, or choose launcher=joblib."
     if any(shutil.which(program) is None for program in ("sbatch", "srun", "sinfo")):
@@ -91,6 +91,11 @@ def check_cluster() -> None:
     except (OSError, subprocess.SubprocessError) as error:
         said = " ".join((getattr(error, "stderr", None) or str(error)).split())
         raise UsageError(f"Slurm does not answer: {said}. {advice}") from error
+
+
+def in_queue() -> bool:
+    """Whether the launcher that was composed last leaves jobs to a queue, which goes on without it."""
+    return HydraConfig.get().runtime.choices.get("hydra/launcher") == LAUNCHERS["slurm"].choice
 
 
 def share() -> int | None:

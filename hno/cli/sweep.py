@@ -27,8 +27,8 @@ from hno.evaluation.format import NAMES, counted, interval, percent, signed, typ
 from hno.evaluation.outcome import pooled
 from hno.report.runs import LOST, at_work
 
-LOG, PREFIX = "sweep.log", ".jobs-"
-"""Names in the folder of a sweep: its log, and how that of a ledger begins."""
+LOG, PREFIX, LEFT = "sweep.log", ".jobs-", "left"
+"""Names in the folder of a sweep: its log, how that of a ledger begins, and what keeps a ledger there."""
 PAUSE = 20.0
 """Time between two pages of a sweep whose jobs fail one after the other, s."""
 NAMED = (*NAMES, "seed")
@@ -108,12 +108,20 @@ class Ledger(NamedTuple):
     @classmethod
     @contextmanager
     def within(cls, sweep: Path, before: Path | None = None, cores: int | None = None) -> Iterator[Ledger]:
-        """A new ledger in the folder of a sweep, which is gone afterwards, as are those of sweeps that were killed."""
+        """A new ledger in the folder of a sweep, which is gone afterwards, as are those that earlier sweeps left."""
         sweep.mkdir(parents=True, exist_ok=True)
         for old in sweep.glob(f"{PREFIX}*"):
             shutil.rmtree(old, ignore_errors=True)
-        with tempfile.TemporaryDirectory(prefix=PREFIX, dir=sweep, ignore_cleanup_errors=True) as folder:
-            yield cls(Path(folder), sweep, before, cores, os.getpid())
+        ledger = cls(Path(tempfile.mkdtemp(prefix=PREFIX, dir=sweep)), sweep, before, cores, os.getpid())
+        try:
+            yield ledger
+        finally:
+            if not (ledger.folder / LEFT).exists():
+                shutil.rmtree(ledger.folder, ignore_errors=True)
+
+    def leave(self) -> None:
+        """Stay when the sweep ends, for jobs that go on without it."""
+        (self.folder / LEFT).touch()
 
     def there(self, job: Job) -> Path | None:
         """The folder in which a job began before, or would have; None where the sweep is not run again."""
