@@ -43,6 +43,7 @@ SlurmUser=slurm
 StorageType=accounting_storage/mysql
 StorageUser=slurm
 StoragePass=one
+StorageLoc=hno_slurm
 LogFile=$work/log/slurmdbd
 PidFile=$work/state/slurmdbd.pid
 END
@@ -50,9 +51,9 @@ chown slurm "$work/conf/slurmdbd.conf" && chmod 600 "$work/conf/slurmdbd.conf"
 
 pgrep -x munged > /dev/null || service munge start
 pgrep -x mariadbd > /dev/null || service mariadb start
-mysql -e "create user if not exists slurm@localhost identified by 'one'; grant all on slurm_acct_db.* to slurm@localhost"
+mysql -e "drop database if exists hno_slurm; create user if not exists slurm@localhost identified by 'one'; grant all on hno_slurm.* to slurm@localhost"
 daemons=()
-trap 'kill "${daemons[@]}" 2> /dev/null || true' EXIT
+trap 'scancel --full --signal=KILL --user=root; sleep 2; kill "${daemons[@]}" 2> /dev/null || true' EXIT
 runuser -u slurm -- env SLURM_CONF="$SLURM_CONF" slurmdbd -D & daemons+=($!)
 for _ in $(seq 60); do sacctmgr -n show cluster > /dev/null 2>&1 && break || sleep 1; done
 sacctmgr -i add cluster one > /dev/null 2>&1 || true
@@ -62,17 +63,17 @@ for _ in $(seq 60); do sinfo -h -o %T | grep -qE "idle|mix" && break || sleep 1;
 sinfo
 
 sweep="$work/sweep"
-words=(experiment=smoke "data.types=[[1,1]]" evaluation.dt=0.25 trainer.max_steps=${STEPS:-300} trainer.validate_every=20)
+words=(experiment=smoke "data.types=[[1,1]]" evaluation.dt=0.25 trainer.max_steps=${STEPS:-200} trainer.validate_every=20)
 words+=("optimizer.lr=1e-3,2e-3,3e-3,4e-3,5e-3,1e30")
 $hno train -m launcher=slurm "${words[@]}" --to "$sweep" & run=$!
 
 job=$sweep/1_narrow_road_hno_auto_sin_lr-0.002
-for _ in $(seq 600); do [ -f "$job/last.ckpt" ] && break || sleep 0.2; done
+until [ -f "$job/last.ckpt" ]; do sleep 0.2; done
 id=$(squeue -h -r -t running -o "%i" | grep "_1$")
 echo "killing job $id"
 scancel --signal=KILL --full "$id"
 wait $run && exit 1 || echo "The sweep ended with exit code $?."
-for _ in $(seq 600); do [ -z "$(squeue -h)" ] && break || sleep 1; done
+while [ -n "$(squeue -h)" ]; do sleep 1; done
 first=$(wc -l < "$sweep/sweep.log")
 
 $hno train sweep="$sweep" launcher=slurm && exit 1 || echo "Again, it ended with exit code $?."

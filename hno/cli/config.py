@@ -19,7 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from hno.cli.arguments import FOLDERS, Arguments, UsageError, rewritten
-from hno.cli.confs import CHOSEN, Folders, choices, config_dir, groups
+from hno.cli.confs import CHOSEN, OWN, Folders, choices, config_dir, groups, hidden
 from hno.cli.harmless import check_harmless
 from hno.cli.schema import GIVEN, REGISTRIES, S, SettingsError, places, validated
 from hno.cli.settings import COMMANDS, TrainSettings
@@ -60,6 +60,9 @@ def for_hydra(name: str, given: Arguments) -> list[str]:
     Folders.own = [] if folder is None else [Path(folder)]
     for file in sorted(path for own in Folders.own for path in own.rglob("*.yaml")):
         check_harmless(file)
+    for file, origin, first in hidden():
+        if origin == OWN:
+            raise UsageError(f"{file} could not be chosen: {first} has a file of that name, which counts. Rename it.")
     for what, why in Folders.broken().items():
         warnings.warn(f"{what} cannot be used, so its choices are missing: {why}", BrokenPluginWarning, stacklevel=2)
     Plugins.instance().register(Folders)

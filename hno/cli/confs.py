@@ -22,6 +22,8 @@ CHOSEN = ("game", "function", "network", "activation", "optimizer")
 """Groups whose choices are registered; methods of `operator` are files, its functions become methods."""
 GROUP = "hno.confs"
 """Entry points of packages that bring configuration: "my_package.conf" is the folder conf in my_package."""
+OWN = "--config-dir"
+"""Where the user's folder comes from."""
 
 
 class Conf(NamedTuple):
@@ -63,7 +65,7 @@ class Folders(SearchPathPlugin):
     def all(cls) -> list[Conf]:
         """Every folder, ours first: of files with one name, the first one counts."""
         found, _ = _of_packages()
-        return [Conf(config_dir(), "hno"), *found, *(Conf(folder, "--config-dir") for folder in cls.own)]
+        return [Conf(config_dir(), "hno"), *found, *(Conf(folder, OWN) for folder in cls.own)]
 
     @classmethod
     def broken(cls) -> dict[str, str]:
@@ -124,12 +126,12 @@ def choices(group: str) -> dict[str, Path | None]:
     return dict(sorted({**found, **{name: path for name, (path, _) in files(group).items()}}.items()))
 
 
-def hidden() -> Iterator[tuple[str, str]]:
-    """Files that another one of the same name keeps from being chosen, and that one's origin."""
+def hidden() -> Iterator[tuple[Path, str, str]]:
+    """Files that one of the same name keeps from being chosen, where they come from, and where that one does."""
     seen = dict[Path, str]()
     for folder, origin in Folders.all():
         for path in sorted(folder.rglob("*.yaml")):
             name = path.relative_to(folder)
             if name in seen:
-                yield f"conf/{name} of {origin}", f"that of {seen[name]} has the same name and counts"
+                yield path, origin, seen[name]
             seen.setdefault(name, origin)

@@ -33,7 +33,8 @@ def run(given: Arguments) -> int:
     unknown = [word for word in given.words if word not in names]
     if unknown:
         raise UsageError(unknown_name("kind", unknown[0], [*KINDS, *others]))
-    failed = Folders.broken() | dict(hidden())
+    failed = Folders.broken()
+    failed |= {f"{path} of {origin}": f"a file of {first} has its name and counts" for path, origin, first in hidden()}
     for kind in dict.fromkeys(names[word] for word in given.words or (*KINDS, *others)):
         print(f"{plural(kind) if kind in KINDS else kind} ({ABOUT.get(kind, f'{kind}=NAME')})")
         for row in _registered(kind, failed) if kind in REGISTRIES else _files(FILES.get(kind, kind)):

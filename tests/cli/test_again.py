@@ -22,6 +22,7 @@ from hno.cli.results import Results
 from hno.cli.resume import own_configuration
 from hno.cli.schema import SettingsError
 from hno.cli.settings import TrainSettings
+from hno.cli.sweep import Ledger
 from hno.training.saving import BEST, LAST
 from tests.cli.conftest import SMOKE, Command
 
@@ -194,6 +195,23 @@ def test_a_sweep_goes_on_where_it_was(
         assert f"Job {job} finished, {how}\n" in (sweep / "sweep.log").read_text()
     refused = command("train", "-m", *SMOKE, "seed=1,2,3", "optimizer.lr=1", f"sweep={sweep}", folder="none")
     assert (refused.code, "optimizer.lr: not given, now 1" in refused.text) == (2, True)
+
+
+def test_a_job_that_a_cluster_begins_again_goes_on(
+    command: Command,
+    tmp_path: Path,
+    settings: TrainSettings,
+    performed: Callable[[dict[int, str]], Done],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Its node failed: to the sweep it has begun already, and its folder says that it runs."""
+    (tmp_path / "sweep").mkdir()
+    job, done = tmp_path / "sweep" / "0_narrow_road_hno_auto_sin", performed({0: "finished"})
+    leave(job, settings, "running")
+    monkeypatch.setattr(Ledger, "knows", lambda ledger, job: True)
+    run = command("train", "-m", *SMOKE, "--to", str(tmp_path / "sweep"), folder="none")
+    assert (run.code, done) == (0, [(0, str(job))]), run.text
+    assert "finished, resumed" in run.text
 
 
 def test_a_job_that_is_refused_keeps_the_results_of_its_folder(

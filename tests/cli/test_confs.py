@@ -63,7 +63,7 @@ def test_a_package_is_listed_with_its_names_and_what_is_wrong_with_others(instal
     for said in (
         f'forgotten = "forgotten.conf" of forgotten 0.1.0: there is no folder {installed}/forgotten/conf; perhaps',
         'absent = "absent:conf" of absent 0.1.0: there is no package absent; expected <package>.<folder>',
-        "conf/optimizer/adam.yaml of hiding 0.1.0: that of hno has the same name and counts",
+        f"{installed}/hiding/conf/optimizer/adam.yaml of hiding 0.1.0: a file of hno has its name and counts",
     ):
         assert f"Could not be loaded: {said}" in found.err
     assert choices("optimizer")["adam"] == ROOT / "conf" / "optimizer" / "adam.yaml"
@@ -87,6 +87,16 @@ def test_what_it_brings_is_chosen_by_name(command: Command) -> None:  # noqa: F8
 def test_without_it_nothing_is_there() -> None:
     assert [conf.origin for conf in Folders.all() if conf.origin.startswith("hno-crossroads")] == []
     assert "crossroads" not in choices("game")
+
+
+def test_a_file_of_ones_own_that_would_not_count_is_refused(command: Command, tmp_path: Path) -> None:  # noqa: F811
+    (tmp_path / "mine" / "experiment").mkdir(parents=True)
+    (tmp_path / "mine" / "experiment" / "smoke.yaml").write_text("seed: 7\n")
+    run = command("train", "experiment=smoke", "--config-dir", str(tmp_path / "mine"), "--dry-run")
+    assert run.code == 2
+    assert (
+        "experiment/smoke.yaml could not be chosen: hno has a file of that name, which counts. Rename it." in run.text
+    )
 
 
 @pytest.fixture(scope="module")
