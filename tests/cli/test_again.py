@@ -39,7 +39,8 @@ def leave(folder: Path, settings: TrainSettings, status: str, **changed: Any) ->
         part, _, name = key.partition("__")
         config[part][name] = value
     folder.mkdir(exist_ok=True)
-    (folder / "results.json").write_text(json.dumps({"status": status, "reason": None, "config": config}))
+    content = {"status": status, "reason": None, "seconds": {}, "config": config}
+    (folder / "results.json").write_text(json.dumps(content))
     return folder
 
 
