@@ -33,7 +33,7 @@ SlurmdPidFile=$work/slurmd.pid
 SlurmctldLogFile=$work/log/slurmctld
 SlurmdLogFile=$work/log/slurmd
 ReturnToService=2
-NodeName=$host Sockets=1 CoresPerSocket=${CPUS:-$(nproc)} ThreadsPerCore=1 State=UNKNOWN
+NodeName=$host Sockets=1 CoresPerSocket=${CPUS:-$(nproc --all)} ThreadsPerCore=1 State=UNKNOWN
 PartitionName=all Nodes=ALL Default=YES MaxTime=INFINITE State=UP
 END
 cat > "$work/conf/slurmdbd.conf" <<END
@@ -69,9 +69,9 @@ $hno train -m launcher=slurm "${words[@]}" --to "$sweep" & run=$!
 
 job=$sweep/1_narrow_road_hno_auto_sin_lr-0.002
 until [ -f "$job/last.ckpt" ]; do sleep 0.2; done
-id=$(squeue -h -r -t running -o "%i" | grep "_1$")
-echo "killing job $id"
-scancel --signal=KILL --full "$id"
+pid=$(grep -o '"process": \["[^"]*", [0-9]*' "$sweep"/.jobs-*/1.json | grep -o '[0-9]*$')
+echo "killing process $pid of job 1"
+kill -KILL "$pid"
 wait $run && exit 1 || echo "The sweep ended with exit code $?."
 while [ -n "$(squeue -h)" ]; do sleep 1; done
 first=$(wc -l < "$sweep/sweep.log")
