@@ -18,7 +18,7 @@ from hno.cli import again, pages
 from hno.cli.arguments import Arguments, UsageError, one_screen, quoted
 from hno.cli.config import REFUSALS, configured, for_hydra, register_plugins, sentence, under_hydra
 from hno.cli.confs import groups
-from hno.cli.launchers import check_cluster, in_queue, keep_to, share, spelled
+from hno.cli.launchers import check_cluster, in_queue, keep_to, share, spelled, without
 from hno.cli.objective import Objective, objective
 from hno.cli.output import fresh, owned
 from hno.cli.perform import Task, perform
@@ -116,18 +116,13 @@ def _multirun(task: Task, given: Arguments, before: Path | None) -> int:
         with tempfile.TemporaryDirectory() as nowhere, ExitStack() as stack:
             folder = Path(nowhere) if dry else _chosen("hydra.sweep.dir", given, HydraConfig.get().sweep.dir)
             stack.enter_context(owned(folder, None if before is None else str(folder), jobs=True))
-            words = [*_here(words), *QUIET] if dry else words
+            words = [*without(words), *QUIET] if dry else words
             if not dry:
                 print(f"Sweep: {folder}", flush=True)
             words = ["--multirun", *words, f"hydra.sweep.dir={quoted(str(folder))}"]
             return _swept(task, words, Ledger.within(folder, before, cores), dry)
     except REFUSALS as error:
         raise _refusal(error) from error
-
-
-def _here(words: Sequence[str]) -> list[str]:
-    """Overrides without the launcher: a dry run stays in this process."""
-    return [word for word in words if not word.lstrip("+").startswith(("hydra/launcher", "hydra.launcher"))]
 
 
 def _swept(task: Task, words: Sequence[str], made: AbstractContextManager[Ledger], dry: bool) -> int:
@@ -185,7 +180,7 @@ def _job(task: Task, config: DictConfig, ledger: Ledger, own: Parts, dry: bool) 
         if dry:
             found = _foreseen(task, settings, current, ledger)
         else:
-            found = _performed(task, config, current, ledger, restarted)
+            found = _performed(task, settings, config, current, ledger, restarted)
     except Exception as error:
         print(f"   refused: {one_screen(sentence(error))}") if dry else _refuse(current, error, ledger)
         return None
@@ -204,17 +199,17 @@ def _foreseen(task: Task, settings: Any, job: Job, ledger: Ledger) -> Entry:
     return Entry(job, succeeded=True)
 
 
-def _performed(task: Task, config: DictConfig, job: Job, ledger: Ledger, restarted: bool) -> Entry:
+def _performed(task: Task, settings: Any, config: DictConfig, job: Job, ledger: Ledger, restarted: bool) -> Entry:
     """Do a job in its folder, or what is left of it; a signal ends the sweep, if it is not this job's process alone.
 
     Args:
         task: of the job.
-        config: of the job.
+        settings: of the job.
+        config: what they were made of.
         job: it.
         ledger: of the sweep.
         restarted: whether it began in this sweep already: a cluster begins it again where a node fails.
     """
-    settings = task.check(config)
     goes_on = (ledger.before is not None or restarted) and (job.folder / RESULTS).exists()
     try:
         with interruptible(), owned(job.folder, str(job.folder) if goes_on else getattr(settings, "resume", None)):

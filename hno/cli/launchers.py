@@ -6,6 +6,7 @@ import importlib.util
 import os
 import shutil
 import subprocess
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from hydra.core.hydra_config import HydraConfig
@@ -64,6 +65,11 @@ def spelled(given: Arguments) -> Arguments:
     if words != given.overrides and "--multirun" not in given.flags:
         raise UsageError("launcher= runs the jobs of a sweep: add -m, or leave it out for a single run.")
     return given._replace(overrides=words)
+
+
+def without(words: Sequence[str]) -> list[str]:
+    """Overrides without the launcher: a dry run stays in this process."""
+    return [word for word in words if not word.lstrip("+").startswith(("hydra/launcher", "hydra.launcher"))]
 
 
 def installed(launcher: Launcher) -> bool:
