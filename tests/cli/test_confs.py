@@ -89,7 +89,12 @@ def test_without_it_nothing_is_there() -> None:
     assert "crossroads" not in choices("game")
 
 
-def test_a_file_of_ones_own_that_would_not_count_is_refused(command: Command, tmp_path: Path) -> None:  # noqa: F811
+def test_a_file_of_ones_own_that_would_not_count_is_refused(
+    command: Command,  # noqa: F811
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(Folders, "own", [])  # as it was, afterwards
     (tmp_path / "mine" / "experiment").mkdir(parents=True)
     (tmp_path / "mine" / "experiment" / "smoke.yaml").write_text("seed: 7\n")
     run = command("train", "experiment=smoke", "--config-dir", str(tmp_path / "mine"), "--dry-run")
