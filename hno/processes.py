@@ -11,8 +11,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1") if hasattr(signal, name)]
-"""Those that ask a process to end; Slurm sends SIGTERM, or SIGUSR1 where it is told to, before it takes a node back."""
+NAMES = "SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1", "SIGUSR2"
+SIGNALS = [getattr(signal, name) for name in NAMES if hasattr(signal, name)]
+"""Those that ask a process to end.
+
+Slurm sends SIGTERM, or what it is told to, before it takes a node back: submitit tells it SIGUSR2.
+"""
 GRACE = 5.0
 """Time that a step under way has to come to its end, s."""
 SAME = 1.0
@@ -52,8 +56,8 @@ class _State:
     """Whether signals are this module's."""
     waits: float | None = None
     """How long it waits for `stop_if_asked`, s; None if it does not."""
-    follows = False
-    """Whether it ends with its parent."""
+    follows: int | None = None
+    """The parent that it ends with."""
     tell: Callable[[int], bool] | None = None
     """Passes a signal on to other processes; whether any of them is to end first."""
 
@@ -184,8 +188,8 @@ def follow(parent: int) -> None:
     Args:
         parent: the id of the process that work is done for; nothing happens where another one started this.
     """
-    if os.getppid() == parent and not _State.follows:
-        _State.follows = True
+    if os.getppid() == parent and _State.follows is None:
+        _State.follows = parent
 
         def orphaned() -> None:
             os.kill(os.getpid(), signal.SIGTERM)
@@ -193,6 +197,11 @@ def follow(parent: int) -> None:
             os._exit(1)  # workers of a pool would wait for more to do
 
         _watch(parent, orphaned)
+
+
+def forsaken() -> bool:
+    """Whether this process follows one that is gone."""
+    return _State.follows not in (None, os.getppid())
 
 
 def _watch(parent: int, orphaned: Callable[[], None]) -> None:

@@ -125,7 +125,7 @@ def test_pages_that_the_sources_name_exist() -> None:
 
 
 OWN = re.compile(
-    r"resume=|=(crossing|values|growing|parametric|lion)\b|\.(growing_residual|coasting)\b|mine\.safetensors"
+    r"(resume|sweep)=|=(crossing|crossroads|values|growing|parametric|lion)\b|\.(growing_residual|coasting)\b|mine\.safetensors"
 )
 """What exists only after a reader has made it; other tests make it."""
 

@@ -11,7 +11,8 @@ from hno.cli import certify as certification
 from hno.cli import evaluate as evaluation
 from hno.cli.arguments import Arguments, quoted
 from hno.cli.build import check
-from hno.cli.config import compose, for_hydra, groups
+from hno.cli.config import compose, for_hydra
+from hno.cli.confs import groups
 from hno.cli.output import fresh, owned
 from hno.cli.results import Results, recorded
 from hno.cli.settings import TrainSettings

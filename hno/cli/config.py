@@ -1,94 +1,29 @@
-"""Where configurations lie, what may be chosen in them, and how they are composed."""
+"""How configurations are composed and judged."""
 
 from __future__ import annotations
 
-import functools
-import importlib.util
 import inspect
 import os
 import sys
+import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
-from importlib.metadata import EntryPoints, entry_points
 from pathlib import Path
 from typing import Any
 
 import hydra
-from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.plugins import Plugins
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
-from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-import hno
 from hno.cli.arguments import FOLDERS, Arguments, UsageError, rewritten
+from hno.cli.confs import CHOSEN, OWN, Folders, choices, config_dir, groups, hidden
 from hno.cli.harmless import check_harmless
 from hno.cli.schema import GIVEN, REGISTRIES, S, SettingsError, places, validated
 from hno.cli.settings import COMMANDS, TrainSettings
-from hno.registry import options_of, plural, reason, unknown_name
-
-CHOSEN = ("game", "function", "network", "activation", "optimizer")
-"""Groups whose choices are registered; methods of `operator` are files, its functions become methods."""
-
-
-def config_dir() -> Path:
-    """The folder `conf`: inside an installed package, beside the package in a checkout."""
-    package = Path(hno.__file__).parent
-    found = next((folder for folder in (package / "conf", package.parent / "conf") if folder.is_dir()), None)
-    if found is None:
-        raise FileNotFoundError(f"The configuration folder conf/ is missing beside {package}. Install hno again.")
-    return found
-
-
-@functools.lru_cache(maxsize=1)
-def _entry_points(path: tuple[str, ...]) -> Any:
-    """All of the process, which takes 20 ms and is asked for a hundred times."""
-    return entry_points()
-
-
-def offered(kind: str) -> EntryPoints:
-    """What installed packages offer of a kind; nothing is imported."""
-    found: EntryPoints = _entry_points(tuple(sys.path)).select(group=f"hno.{plural(kind)}")
-    return found
-
-
-class Folders(SearchPathPlugin):
-    """Folders of configuration files besides our own: `conf` of packages that offer plugins, and --config-dir."""
-
-    own: Sequence[Path] = ()
-    """The user's."""
-
-    @classmethod
-    def all(cls) -> list[Path]:
-        """Every folder, ours first."""
-        points = [point for kind in REGISTRIES for point in offered(kind)]
-        packages = sorted({point.value.partition(":")[0].split(".")[0].strip() for point in points})
-        specs = (importlib.util.find_spec(name) for name in packages if name.isidentifier())
-        places = [Path(place) for spec in specs if spec for place in spec.submodule_search_locations or ()]
-        others = [place / "conf" for place in places if (place / "conf").is_dir()]
-        return [config_dir(), *others, *cls.own]
-
-    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
-        """Hydra's hook."""
-        for folder in self.all()[1:]:
-            search_path.append("hno", f"file://{folder.resolve()}")
-
-
-def groups(name: str) -> list[str]:
-    """Groups that a root configuration composes."""
-    defaults: Any = OmegaConf.select(OmegaConf.load(config_dir() / f"{name}.yaml"), "defaults") or []
-    return [str(group) for entry in defaults if OmegaConf.is_dict(entry) for group in entry]
-
-
-def choices(group: str) -> dict[str, Path | None]:
-    """Choices of a group and their files; those of plugins without a file have none. Nothing is imported."""
-    found: dict[str, Path | None] = {}
-    if group in CHOSEN:
-        found = {point.name: None for point in offered(group)}
-    files = (path for folder in Folders.all() for path in (folder / group).glob("*.yaml"))
-    return dict(sorted({**found, **{path.stem: path for path in files}}.items()))
+from hno.registry import BrokenPluginWarning, options_of, reason, unknown_name
 
 
 def register_plugins() -> None:
@@ -125,6 +60,11 @@ def for_hydra(name: str, given: Arguments) -> list[str]:
     Folders.own = [] if folder is None else [Path(folder)]
     for file in sorted(path for own in Folders.own for path in own.rglob("*.yaml")):
         check_harmless(file)
+    for file, origin, first in hidden():
+        if origin == OWN:
+            raise UsageError(f"{file} could not be chosen: {first} has a file of that name, which counts. Rename it.")
+    for what, why in Folders.broken().items():
+        warnings.warn(f"{what} cannot be used, so its choices are missing: {why}", BrokenPluginWarning, stacklevel=2)
     Plugins.instance().register(Folders)
     composed, paths, many = groups(name), FOLDERS | places(COMMANDS[name]), "--multirun" in given.flags
     swept: Collection[str] = ()
@@ -189,7 +129,7 @@ def _missing(file: str, known: list[str]) -> str:
     kind = group.removeprefix("hydra/")
     if kind in ("launcher", "sweeper") and kind != group:
         return f"{said} Where there is a package for it: pip install hydra-{choice.split('_')[0]}-{kind}"
-    return said
+    return " ".join([said, *(f"Could not be loaded: {what}: {why}." for what, why in Folders.broken().items())])
 
 
 def read(model: type[S], config: DictConfig) -> S:
@@ -203,7 +143,7 @@ def read(model: type[S], config: DictConfig) -> S:
     """
     hydra_config = HydraConfig.get()
     chosen = hydra_config.runtime.choices.get("experiment")
-    files = [folder / "experiment" / f"{chosen}.yaml" for folder in Folders.all()]
+    files = [folder / "experiment" / f"{chosen}.yaml" for folder, _ in Folders.all()]
     helpers = {key for file in files if file.exists() for key in OmegaConf.load(file)}
     given = {override.partition("=")[0].lstrip("+~") for override in hydra_config.overrides.task}
     others = TrainSettings.model_fields.keys() - {key.split(".")[0] for key in given}

@@ -19,6 +19,7 @@ from hno.cli.config import read
 from hno.cli.landscapes import write_landscape
 from hno.cli.logs import loggers, use_threads
 from hno.cli.media import draw_typical, publish
+from hno.cli.perform import Task
 from hno.cli.progress import label_progress, progress
 from hno.cli.results import Results, write_json
 from hno.cli.sections import chosen_sections, run_sections
@@ -46,12 +47,11 @@ log = logging.getLogger(__name__)
 Model = LearnedPolicy | ExportedPolicy
 Types = tuple[float, ...]
 """One type per player."""
-Table = list[dict[str, Any]]
 
 
 def run(given: Arguments) -> int:
     """`hno evaluate`."""
-    return launch.run(launch.Task("evaluate", check, head, evaluate), given)
+    return launch.run(Task("evaluate", check, head, evaluate, models_of), given)
 
 
 def check(config: DictConfig) -> EvaluateSettings:
@@ -71,8 +71,12 @@ def check(config: DictConfig) -> EvaluateSettings:
 
 def head(settings: EvaluateSettings) -> dict[str, Any]:
     """What results.json says from the beginning."""
-    first = model_file(settings.checkpoint[0])
-    return {"checkpoint": first, "config": settings.model_dump()}
+    return {"checkpoint": str(models_of(settings)[0]), "config": settings.model_dump()}
+
+
+def models_of(settings: EvaluateSettings) -> list[Path]:
+    """The models of an evaluation, see `model_file`."""
+    return [Path(model_file(path)) for path in settings.checkpoint]
 
 
 def model_file(path: str) -> str:

@@ -15,7 +15,9 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
 from hno.cli.arguments import Arguments
-from hno.cli.config import choices, compose, config_dir, for_hydra, groups
+from hno.cli.config import compose, for_hydra
+from hno.cli.confs import choices, config_dir, groups
+from hno.cli.launchers import LAUNCHERS, installed
 from hno.cli.schema import SettingsError
 
 BESIDE = 44
@@ -40,6 +42,8 @@ ABOUT = {
     "debug": "a run that looks for a mistake; it is laid over all the others",
 }
 """What every group is for."""
+SWEPT = "train", "evaluate"
+"""Commands that take -m."""
 
 
 def configuration_help(name: str, given: Arguments) -> str:
@@ -58,6 +62,8 @@ def configuration_help(name: str, given: Arguments) -> str:
         said[f"{group}.name"] = f"chosen by {group}=<name>"
         for path in (known[one] for one in ("default", *chosen) if known.get(one) is not None):
             said.update(_comments_of(path, group))
+    if name in SWEPT:
+        parts.append(_launchers())
     head = "Groups, group=choice (*: chosen)\n" + "\n".join(parts) + "\n\n" if parts else ""
     text = yaml.dump(OmegaConf.to_container(config, resolve=False), Dumper=_Flow, sort_keys=False, width=10**6)
     lines = [(f"  {line}".replace(": ???", ": (required)"), key) for line, key in _keyed(text)]
@@ -96,6 +102,18 @@ def _group(group: str, known: Mapping[str, Path | None], chosen: Collection[str]
         mark = "*" if choice in chosen else " "
         lines.append(f"    {mark} {choice:<16}{'' if path is None else heading(path)}".rstrip())
     return "\n".join(_folded(line, " " * 22) for line in lines)
+
+
+def _launchers() -> str:
+    """Launchers as a group, and how those that are not installed can be."""
+    lines = ["  launcher: with -m, what runs the jobs; launcher.<option>=<value>"]
+    for name, launcher in LAUNCHERS.items():
+        lines.append(f"    {'*' if name == 'basic' else ' '} {name:<16}{launcher.about}{_missing(name)}")
+    return "\n".join(_folded(line, " " * 22) for line in lines)
+
+
+def _missing(name: str) -> str:
+    return "" if installed(LAUNCHERS[name]) else f" (not installed: pip install 'hno[{name}]')"
 
 
 def _folded(line: str, indent: str) -> str:

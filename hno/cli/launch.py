@@ -4,35 +4,31 @@ from __future__ import annotations
 
 import logging
 import os
-import shlex
 import sys
 import tempfile
-import traceback
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
-from lightning.fabric.utilities.exceptions import MisconfigurationException
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
-import hno
-from hno.cli import pages
+from hno.cli import again, pages
 from hno.cli.arguments import Arguments, UsageError, one_screen, quoted
-from hno.cli.config import REFUSALS, configured, for_hydra, groups, register_plugins, sentence, under_hydra
-from hno.cli.logs import finish_wandb, refuse_wandb
+from hno.cli.config import REFUSALS, configured, for_hydra, register_plugins, sentence, under_hydra
+from hno.cli.confs import groups
+from hno.cli.launchers import check_cluster, in_queue, keep_to, share, spelled, without
 from hno.cli.objective import Objective, objective
 from hno.cli.output import fresh, owned
-from hno.cli.progress import collect_messages
-from hno.cli.results import Results, recorded
+from hno.cli.perform import Task, perform, refuse
 from hno.cli.schema import REGISTRIES
-from hno.cli.sections import show
 from hno.cli.sweep import Entry, Job, Ledger, show_jobs
-from hno.cli.swept import named, swept_keys
-from hno.evaluation.format import NAMES, counted
-from hno.processes import Interrupted, follow, interruptible, passed_on
-from hno.registry import UnknownNameError
+from hno.cli.swept import folders_named
+from hno.data.folders import LOCK, held
+from hno.evaluation.format import counted
+from hno.processes import Interrupted, follow, forsaken, interruptible, passed_on
+from hno.report.runs import RESULTS
 
 log = logging.getLogger(__name__)
 
@@ -41,19 +37,6 @@ QUIET = ("hydra/hydra_logging=disabled", "hydra/job_logging=disabled", "hydra.ou
 
 Parts = Mapping[str, Mapping[str, Any]]
 """Classes and functions by kind and name."""
-
-
-class Task(NamedTuple):
-    """What a command does in every job."""
-
-    name: str
-    """The root configuration."""
-    check: Callable[[DictConfig], Any]
-    """Judges a composed configuration before any work, and returns its settings."""
-    head: Callable[[Any], dict[str, Any]]
-    """What results.json says from the beginning, from the settings."""
-    work: Callable[[Any, Results], None]
-    """Does the job, from the settings."""
 
 
 def run(task: Task, given: Arguments) -> int:
@@ -69,8 +52,10 @@ def run(task: Task, given: Arguments) -> int:
         UsageError: nothing was done, since the configuration makes no run, or its folder is another's.
         Interrupted: a signal ended it.
     """
+    given, before = again.going_on(given)
+    given = spelled(given)
     if "--multirun" in given.flags:
-        return _multirun(task, given)
+        return _multirun(task, given, before)
     settings = configured(task.name, task.check, given)
     if settings is None:
         return 0  # a dry run
@@ -109,49 +94,45 @@ def _refusal(error: Exception) -> UsageError:
     return UsageError(sentence(error))
 
 
-def _multirun(task: Task, given: Arguments) -> int:
+def _multirun(task: Task, given: Arguments, before: Path | None) -> int:
     """Let Hydra's launcher run every job. It ends with a table, also when it is interrupted; a dry one prints its jobs.
 
     Launchers run jobs in processes of their own: what became of each is in a file of the ledger.
+
+    Args:
+        task: of every job.
+        given: the command line.
+        before: the folder of the sweep that is run again, if one is.
     """
     dry = "--dry-run" in given.flags
     try:
         words = for_hydra(task.name, given)
+        words, cores = [*words, *folders_named(words, groups(task.name))], share()
+        check_cluster()
+        if before is not None:
+            again.check_same(before, task.name, words)
         register_plugins()
         with tempfile.TemporaryDirectory() as nowhere, ExitStack() as stack:
             folder = Path(nowhere) if dry else _chosen("hydra.sweep.dir", given, HydraConfig.get().sweep.dir)
-            stack.enter_context(owned(folder, jobs=True))
-            words = [*_here(words), *QUIET] if dry else [*words, *_named(task, words)]
+            stack.enter_context(owned(folder, None if before is None else str(folder), jobs=True))
+            words = [*without(words), *QUIET] if dry else words
             if not dry:
                 print(f"Sweep: {folder}", flush=True)
-            return _swept(task, ["--multirun", *words, f"hydra.sweep.dir={quoted(str(folder))}"], folder, dry)
+            words = ["--multirun", *words, f"hydra.sweep.dir={quoted(str(folder))}"]
+            return _swept(task, words, Ledger.within(folder, before, cores), dry)
     except REFUSALS as error:
         raise _refusal(error) from error
 
 
-def _named(task: Task, words: Sequence[str]) -> list[str]:
-    """Name the folders of jobs by what was swept, unless the command line names them."""
-    if any(word.lstrip("+").startswith("hydra.sweep.subdir=") for word in words):
-        return []
-    hydra = HydraConfig.get()
-    sweep: Any = OmegaConf.to_container(hydra.sweep)  # as it is written, with its interpolations
-    keys = swept_keys(words, hydra.sweeper.get("params") or {})
-    folder = quoted(named(str(sweep["subdir"]), keys, groups(task.name)))
-    return [f"hydra.sweep.subdir={folder}"] if keys else []
-
-
-def _here(words: Sequence[str]) -> list[str]:
-    """Overrides without the launcher: a dry run stays in this process."""
-    return [word for word in words if not word.lstrip("+").startswith(("hydra/launcher", "hydra.launcher"))]
-
-
-def _swept(task: Task, words: Sequence[str], folder: Path, dry: bool) -> int:
-    own, this = {kind: registry().own() for kind, registry in REGISTRIES.items()}, os.getpid()
-    failure = None
-    with Ledger.within(folder) as ledger:
+def _swept(task: Task, words: Sequence[str], made: AbstractContextManager[Ledger], dry: bool) -> int:
+    own = {kind: registry().own() for kind, registry in REGISTRIES.items()}
+    failure, queued = None, in_queue()
+    with made as ledger:
+        command = again.command(task.name, ledger.sweep)
 
         def job(config: DictConfig) -> Objective:  # a launcher may send it to another process
-            follow(this)
+            follow(ledger.process)
+            keep_to(ledger.cores)
             return _job(task, config, ledger, own, dry)
 
         try:
@@ -161,19 +142,23 @@ def _swept(task: Task, words: Sequence[str], folder: Path, dry: bool) -> int:
             if isinstance(error, REFUSALS) and not ledger.entries():
                 raise
             failure = error
+            if queued:
+                ledger.leave()
         finally:
             found = ledger.entries()
             if found and not dry:
-                show_jobs([entry.job for entry in found])
+                whole = failure is None and all(entry.succeeded for entry in found)
+                show_jobs([entry.job for entry in found], None if whole else command)
         if ledger.signal is not None:
             stop = Interrupted(ledger.signal)
-            stop.add_note(f"{counted(len(found), 'job')} had begun. Go on with each by: hno train resume=<its folder>")
+            stop.add_note(f"{counted(len(found), 'job')} had begun. Go on with: {command}")
             raise stop
     refused = sum(not entry.succeeded for entry in found)
     if dry:
         print(counted(len(found), "job") + (f", {refused} refused" if refused else ""))
     if failure is not None:
-        print(f"The launcher ended before all jobs did: {one_screen(sentence(failure))}", file=sys.stderr)
+        on = " Those that are in the queue go on without it." if queued else ""
+        print(f"The launcher ended before all jobs did: {one_screen(sentence(failure))}{on}", file=sys.stderr)
     return 1 if refused or failure is not None else 0
 
 
@@ -185,69 +170,73 @@ def _job(task: Task, config: DictConfig, ledger: Ledger, own: Parts, dry: bool) 
         for name, part in parts.items():
             REGISTRIES[kind]().register(name)(part)
     current = Job.current()
+    restarted = ledger.knows(current)
     ledger.write(Entry.begun(current))
     if dry:
         print(f"{current.number}: {' '.join(current.settings)}")
     try:
         settings = task.check(config)
+        if dry:
+            found = _foreseen(task, settings, current, ledger)
+        else:
+            found = _performed(task, settings, config, current, ledger, restarted)
     except Exception as error:
-        print(f"   refused: {one_screen(sentence(error))}") if dry else _refuse(task, config, current, error)
+        print(f"   refused: {one_screen(sentence(error))}") if dry else _refuse(task, config, current, error, ledger)
         return None
-    found = None if dry else _performed(task, settings, current, ledger)
-    ledger.write(Entry(current, dry or found is not None))
-    return objective(settings, found)
+    ledger.write(found)
+    if not dry:
+        ledger.tell(found.job)
+    return objective(settings, found.job.results()) if found.succeeded and not dry else None
 
 
-def _performed(task: Task, settings: Any, job: Job, ledger: Ledger) -> Results | None:
-    """Do a job in its folder; a signal ends the sweep, not only the job."""
-    try:
-        with interruptible(), owned(job.folder, getattr(settings, "resume", None)):
-            return perform(task, settings, job.folder)
-    except Interrupted as stop:
-        ledger.stop(stop.number)
-    except UsageError as error:
-        log.error("%s", error)
-    return None
+def _foreseen(task: Task, settings: Any, job: Job, ledger: Ledger) -> Entry:
+    """What would become of a job; of one that has begun before, it is said."""
+    there = ledger.there(job)
+    if there is not None:
+        how = "at work" if held(there / LOCK) else again.planned(there, settings, task.reads(settings))
+        print(f"   {how}") if how else None
+    return Entry(job, succeeded=True)
 
 
-def _refuse(task: Task, config: DictConfig, job: Job, error: Exception) -> None:
-    """Leave the reason in the results of a job that is not run: it is no failure of the jobs after it."""
-    chosen = HydraConfig.get().runtime.choices
-    results = Results(job.folder / "results.json", {group: chosen.get(group) for group in NAMES})
-    results.update(status="failed", reason=sentence(error))
-    log.error("%s", one_screen(sentence(error)))
-    content: Any = OmegaConf.to_container(config, resolve=False)
-    refuse_wandb(content, results.content, job.folder, task.name)
+def _performed(task: Task, settings: Any, config: DictConfig, job: Job, ledger: Ledger, restarted: bool) -> Entry:
+    """Do a job in its folder, or what is left of it; a signal ends the sweep, if it is not this job's process alone.
 
-
-def perform(task: Task, settings: Any, folder: Path) -> Results | None:
-    """Do one job; its folder gets results.json.
-
-    Returns:
-        What came of it; None where it failed, which has been logged and is in its folder.
+    Args:
+        task: of the job.
+        settings: of the job.
+        config: what they were made of.
+        job: it.
+        ledger: of the sweep.
+        restarted: whether it began in this sweep already: a cluster begins it again where a node fails.
     """
-    collect_messages()
-    results = Results(folder / "results.json", task.head(settings))
+    goes_on = (ledger.before is not None or restarted) and (job.folder / RESULTS).exists()
     try:
-        with recorded(results):
-            task.work(settings, results)
+        with interruptible(), owned(job.folder, str(job.folder) if goes_on else getattr(settings, "resume", None)):
+            if goes_on:
+                job = job._replace(how=again.planned(job.folder, settings, task.reads(settings)))
+                ledger.write(Entry.begun(job))
+            if job.how == again.SKIPPED:
+                return Entry(job, succeeded=True)
+            if job.how == again.REPEATED:
+                again.clear(job.folder)
+            elif job.how == again.RESUMED_JOB:
+                config.resume = str(job.folder)
+                settings = task.check(config)
+            return Entry(job, perform(task, settings, job.folder) is not None)
     except Interrupted as stop:
-        if hasattr(settings, "resume"):
-            stop.add_note(f"Go on with: hno train resume={shlex.quote(str(folder))}")
-        raise
-    except Exception as error:
-        _log(error)
-        return None
-    finally:
-        finish_wandb(results.content, folder)
-    show(results.content, folder)
-    return results
+        if ledger.process == os.getpid() or forsaken():
+            ledger.stop(stop.number)
+    return Entry(job)
 
 
-def _log(error: Exception) -> None:
-    """Log what went wrong: one message for errors that were raised on purpose, a traceback for surprises."""
-    frames = traceback.extract_tb(error.__traceback__)
-    ours = bool(frames) and Path(frames[-1].filename).is_relative_to(Path(hno.__file__).parent)
-    meant = ours and isinstance(error, (ValueError, RuntimeError, UnknownNameError))
-    expected = meant or isinstance(error, (OSError, MisconfigurationException))
-    log.error("%s", error, exc_info=None if expected else error)
+def _refuse(task: Task, config: DictConfig, job: Job, error: Exception, ledger: Ledger) -> None:
+    """Leave the reason in the results of a job that is not run: the jobs after it go on.
+
+    Not in a folder that is another's (a `UsageError`), or has results of its own.
+    """
+    job = job._replace(refusal=sentence(error))
+    if not isinstance(error, UsageError) and again.results(job.folder).get("status", "failed") == "failed":
+        refuse(task, config, job.folder, job.refusal)
+    log.error("%s", one_screen(job.refusal))
+    ledger.write(Entry(job))
+    ledger.tell(job)

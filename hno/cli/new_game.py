@@ -31,7 +31,7 @@ def run(given: Arguments) -> int:
         raise UsageError(f"A game's name is made of small letters, digits and _, as a module's; got {name!r}.")
     if any(keyword.iskeyword(word) or word in TAKEN for word in (name, cls)):
         raise UsageError(f"{name!r} means something else in the game's file already: choose another name.")
-    from hno.cli.config import choices
+    from hno.cli.confs import choices
 
     if name in choices("game"):
         raise UsageError(f"There is a game {name!r} already (see `hno list game`): choose another name.")

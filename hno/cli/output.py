@@ -56,9 +56,10 @@ def owned(folder: Path, resume: str | None = None, *, jobs: bool = False) -> Ite
         places = [path for path in sorted(folder.iterdir()) if path.is_dir()] if jobs else [folder]
         left = next((found for place in places if (found := _left(place)) is not None), None)
         if left is not None and not goes_on:
+            there = "run the sweep there again: sweep" if jobs else "go on with the run that is there: resume"
             raise UsageError(
-                f"{left} would be overwritten. Choose another folder with --to, remove this one, or go on with the run "
-                "that is there: resume=<its folder>."
+                f"{left} would be overwritten. Choose another folder with --to, remove this one, or {there}=<its "
+                "folder>."
             )
         yield
 

@@ -17,7 +17,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
 from hno.cli.arguments import FOLDERS, Arguments, as_path, quoted
-from hno.cli.schema import SettingsError
+from hno.cli.schema import Settings, SettingsError
 from hno.cli.settings import TrainSettings
 from hno.data.store import replace_whole
 from hno.report.runs import METRICS, RESULTS
@@ -153,8 +153,8 @@ def newest(folder: Path) -> Path | None:
     return find_checkpoint(folder, RESUMED) if any((folder / name).exists() for name in RESUMED) else None
 
 
-def changes(settings: TrainSettings, before: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
-    """Keys that differ from those in the results of the run that goes on, with both values."""
+def changes(settings: Settings, before: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
+    """Keys that differ from those in the results of a run, with both values."""
     now = json.loads(json.dumps(settings.model_dump(exclude={"resume"})))
     return _differing(flat(before["config"]), flat(now))
 

@@ -6,9 +6,11 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
+from hno.cli.arguments import quoted
 from hno.evaluation.format import NAMES
 from hno.report.variants import matters
 
@@ -22,6 +24,21 @@ def file_name(value: Any) -> str:
 
 
 OmegaConf.register_new_resolver("file_name", file_name, replace=True)
+
+
+def folders_named(words: Sequence[str], choices: Iterable[str]) -> list[str]:
+    """The word that names folders of jobs by what was swept; none where the command line names them.
+
+    Args:
+        words: the command line, as Hydra takes it; its configuration was composed last.
+        choices: keys that choose from a group.
+    """
+    if any(word.lstrip("+").startswith("hydra.sweep.subdir=") for word in words):
+        return []
+    hydra = HydraConfig.get()
+    sweep: Any = OmegaConf.to_container(hydra.sweep)  # as it is written, with its interpolations
+    keys = swept_keys(words, hydra.sweeper.get("params") or {})
+    return [f"hydra.sweep.subdir={quoted(named(str(sweep['subdir']), keys, choices))}"] if keys else []
 
 
 def swept_keys(words: Iterable[str], params: Mapping[str, Any]) -> list[str]:

@@ -18,6 +18,7 @@ from hno.cli.film import Film
 from hno.cli.landscapes import write_landscape
 from hno.cli.logs import loggers, rates, use_threads
 from hno.cli.media import publish
+from hno.cli.perform import Task
 from hno.cli.progress import StepLines, label_progress, progress
 from hno.cli.results import Results
 from hno.cli.resume import finished, history, in_its_folder, run_folder, take_over, training_hash
@@ -40,7 +41,7 @@ log = logging.getLogger(__name__)
 
 def run(given: Arguments) -> int:
     """`hno train`; of a run that is finished and resumed with nothing new, its results."""
-    task, there = launch.Task("train", check, head, train), in_its_folder(given)
+    task, there = Task("train", check, head, train), in_its_folder(given)
     if there is not given and "--dry-run" not in given.flags:
         settings = configured("train", check, there)
         if settings is not None and (results := finished(settings)):

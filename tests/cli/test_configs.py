@@ -10,7 +10,8 @@ from omegaconf import DictConfig
 from hno.cli.arguments import Arguments
 from hno.cli.build import build, check
 from hno.cli.calls import train_settings
-from hno.cli.config import choices, compose, config_dir, for_hydra, groups, register_plugins
+from hno.cli.config import compose, for_hydra, register_plugins
+from hno.cli.confs import choices, config_dir, groups
 from hno.cli.main import main
 from hno.cli.resume import training_hash
 from hno.cli.settings import TrainSettings

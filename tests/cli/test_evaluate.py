@@ -10,7 +10,7 @@ from omegaconf import OmegaConf
 from torch import Tensor
 
 import hno
-from hno.cli.config import config_dir
+from hno.cli.confs import config_dir
 from hno.cli.evaluate import types_to_evaluate
 from hno.control.rollout import Policy
 from hno.data import labels as label_data

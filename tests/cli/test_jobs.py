@@ -78,7 +78,7 @@ def test_a_failed_job_is_in_the_table_with_its_reason_and_the_others_go_on(comma
     sweep = tmp_path / "sweep"
     run = command("train", "-m", f"hydra.sweep.dir={sweep}", *SMOKE, "trainer.max_steps=2", "optimizer.lr=1e30,0.001")
     assert run.code == 1
-    table = run.text[run.text.index("2 jobs") :]
+    table = run.text[run.text.rindex("2 jobs") :]
     assert [(row[0], row[6], row[-1]) for row in lines(table)] == [
         ("0", "optimizer.lr=1e+30", "failed"), ("1", "optimizer.lr=0.001", "finished"),
     ]  # fmt: skip
@@ -114,7 +114,7 @@ def test_an_interrupted_multirun_shows_what_there_is(
     monkeypatch.setattr(launch, "perform", perform)
     monkeypatch.setattr(launch, "objective", lambda *job: None)
     printed: list[int] = []
-    monkeypatch.setattr("hno.cli.launch.show_jobs", lambda jobs: printed.extend(job.number for job in jobs))
+    monkeypatch.setattr("hno.cli.launch.show_jobs", lambda jobs, again: printed.extend(job.number for job in jobs))
     run = command("train", "-m", f"hydra.sweep.dir={tmp_path}/sweep", *SMOKE, "seed=0,1,2")
     assert run.code == 130
     assert printed == [0, 1]

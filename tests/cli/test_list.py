@@ -6,9 +6,11 @@ from pathlib import Path
 
 import pytest
 
+from hno.cli.confs import groups
 from hno.cli.listing import KINDS
 from hno.cli.main import main
 from hno.games import games
+from hno.registry import plural
 from tests.walkers import Walkers
 
 Printed = pytest.CaptureFixture[str]
@@ -18,10 +20,13 @@ def test_every_kind_is_listed_with_a_line_for_each_name(capsys: Printed) -> None
     assert main(["list"]) == 0
     printed = capsys.readouterr().out
     for name in ("drone", "hno", "potential", "deeponet", "sin", "residual", "band", "soap"):
-        (line,) = [line for line in printed.splitlines() if line.startswith(f"  {name} ")]
+        line, *_ = [line for line in printed.splitlines() if line.startswith(f"  {name} ")]
         assert line.endswith("]")
         assert len(line.split()) > 3, "every name has a summary"
-    assert len([line for line in printed.splitlines() if line and not line.startswith(" ")]) == len(KINDS)
+    heads = [line.split(" (")[0] for line in printed.splitlines() if line and not line.startswith(" ")]
+    assert heads[: len(KINDS)] == list(map(plural, KINDS))
+    assert {"data", "experiment", "trainer"} <= set(heads)
+    assert not set(groups("train")) - {*heads, *KINDS, "operator", "callbacks"}, "every group of choices is listed"
 
 
 def test_some_kinds_in_the_singular_or_the_plural(capsys: Printed) -> None:

@@ -111,7 +111,7 @@ def grid(command: Command, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> I
             return Results(folder / "results.json", {})
 
         monkeypatch.setattr(launch, "perform", take)
-        monkeypatch.setattr(launch, "show_jobs", lambda jobs: None)
+        monkeypatch.setattr(launch, "show_jobs", lambda jobs, again: None)
         run = command("train", *overrides, "experiment=paper_grid", f"hydra.sweep.dir={tmp_path}/sweep")
         assert run.code == 0, run.text
         return made

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from hno.cli.config import choices
+from hno.cli.confs import choices
 from hno.cli.curve import CurveLogger, read_rows
 from hno.training.saving import LAST, PREVIOUS, read_content
 from tests.cli.conftest import Command, clean_globals, command, no_labels, no_pages, refused  # noqa: F401  # fixtures

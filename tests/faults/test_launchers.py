@@ -5,15 +5,17 @@ from __future__ import annotations
 import os
 import signal
 from pathlib import Path
+from typing import Any
 
 import pytest
+import torch
 
 from hno.training.optimizers import optimizers
 from tests.cli.conftest import SMOKE, clean_globals, command, no_pages  # noqa: F401  # fixtures
 from tests.cli.conftest import Command as Run
 
 LAUNCHERS = {
-    "joblib": ("hydra/launcher=joblib", "hydra.launcher.n_jobs=2"),
+    "joblib": ("launcher=joblib", "launcher.n_jobs=2"),
     "submitit": ("hydra/launcher=submitit_local", "hydra.launcher.timeout_min=5"),
 }
 
@@ -35,6 +37,11 @@ def killing(parameters: object, lr: float = 1.0) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
+def sgd(parameters: Any, lr: float = 1.0) -> torch.optim.Optimizer:
+    """One that nobody kills."""
+    return torch.optim.SGD(parameters, lr=lr)
+
+
 @pytest.mark.slow
 def test_a_worker_that_is_killed_ends_the_sweep_with_the_likely_reason(
     command: Run,  # noqa: F811
@@ -52,6 +59,10 @@ def test_a_worker_that_is_killed_ends_the_sweep_with_the_likely_reason(
     assert "excessive memory usage" in run.text
     assert "Traceback" not in run.text
     assert f"Page: {tmp_path}/sweep" in run.text
+    optimizers._classes["killing"] = sgd  # type: ignore[assignment]  # as if mended
+    again = command("train", f"sweep={tmp_path}/sweep", folder="none")
+    assert again.code == 0, again.text
+    assert again.text.count("finished, repeated") == 2, "they were killed before their first checkpoint"
 
 
 def test_a_launcher_that_is_not_there_is_named_with_its_package(command: Run, tmp_path: Path) -> None:  # noqa: F811

@@ -255,6 +255,20 @@ def test_no_job_outlives_a_sweep_that_is_killed(tmp_path: Path, cache: Path) -> 
     assert len([*(tmp_path / "run").rglob(LAST)]) == 2
 
 
+@pytest.mark.slow
+def test_a_signal_to_one_job_ends_that_one_alone(tmp_path: Path, cache: Path) -> None:
+    """As a scheduler sends it."""
+    runs = tmp_path / "run"
+    steps = ("trainer.max_steps=200", "data.workers=1", "seed=0,1", *LAUNCHERS["joblib"], "--to", str(runs))
+    with started("sweep", tmp_path, cache, *TRAIN, *steps, "-m") as command:
+        command.until(lambda: any("step 5 of" in log.read_text() for log in runs.glob("0_*/train.log")))
+        (entry,) = runs.glob(".jobs-*/0.json")
+        os.kill(json.loads(entry.read_text())["process"][1], signal.SIGTERM)
+        command.process.wait(300)
+    found = {path.parent.name[0]: json.loads(path.read_text())["status"] for path in runs.rglob("results.json")}
+    assert found == {"0": "interrupted", "1": "finished"}
+
+
 def after_in_a_sweep(name: str, launcher: str, tmp_path: Path, cache: Path) -> tuple[Left, list[tuple[str, str]]]:
     """What is left of a sweep after a signal while its jobs train, and what became of them."""
     if launcher != "basic":

@@ -1,0 +1,1 @@
+"""Four cars at a crossing of two roads, for hno."""
