@@ -49,6 +49,13 @@ def test_nothing_in_a_table_is_cut_and_no_line_is_too_long(width: int) -> None:
     assert (width < 200) == (sum(line.startswith("theta") for line in lines) > 1)
 
 
+def test_a_long_word_is_not_parted() -> None:
+    """Text takes several lines; a path among it stays one that can be copied."""
+    path = "multirun/2026-11-28/12-00-00/0_narrow_road_sno_sin/best.ckpt"
+    lines = table(80, ["run", "reason"], [["0", f"the file at this place cannot be read: {path}"]])
+    assert any(path in line for line in lines)
+
+
 def test_every_column_stands_in_one_part_behind_the_first() -> None:
     draw = random.Random(0)
     for _ in range(50):

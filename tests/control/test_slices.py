@@ -39,6 +39,18 @@ def test_its_states_have_the_coordinates_of_its_sides(policy: Feedback) -> None:
     assert (found.up.values[0], found.up.values[-1]) == (19, 22)
 
 
+def test_by_default_half_the_game_is_left_and_types_are_in_the_middle(policy: Feedback) -> None:
+    found = policy.slice(points=2)
+    assert (found.tau, found.theta) == (policy.game.horizon / 2, (3.0, 3.0))
+
+
+def test_one_violated_constraint_of_one_player_is_a_violation(policy: Feedback) -> None:
+    safe = -np.ones((2, 2, 3, 2))
+    safe[0, 1, 2, 1] = 0.5
+    violation = policy.slice(points=2)._replace(constraint=safe).violation
+    np.testing.assert_array_equal(violation, [[-1, 0.5], [-1, -1]])
+
+
 def test_the_violation_is_positive_exactly_in_the_violation_set(policy: Feedback) -> None:
     found = policy.slice(points=21)
     x, theta = torch.from_numpy(found.x).float(), torch.tensor(found.theta)
