@@ -41,6 +41,15 @@ COMMANDS = {
         "Solve labels, train an operator and evaluate it. The run's folder gets checkpoints, metrics and results.json.",
         "train", to=FOLDERS, flags=JOBS,
     ),
+    "tune": Command(
+        "hno.cli.tune:run", "key=interval(A,B) key=a,b ... [key=value ...] [trials=20] [storage=URL study=NAME]",
+        "Search settings of a training with Optuna. Searched is what a sweep could be over: key=a,b, "
+        "'key=range(1,9)', 'key=interval(0,1)', 'key=tag(log,interval(1e-4,1e-2))'; objective=[a,b] are minimised "
+        "together. trials=20: of the whole study; at_once=<as many as the launcher runs>; search=tpe|random|nsga2|gp, "
+        "search.seed=0; pruner=median|halving: ends hopeless runs; search.<option>, pruner.<option>: Optuna's; "
+        "sweep=FOLDER: go on. The keys are those of hno train.",
+        "train", to=FOLDERS, flags=("--dry-run", "--to", "--config-dir", "--shell-completion"),
+    ),
     "evaluate": Command(
         "hno.cli.evaluate:run", "checkpoint=FILE [key=value ...] [-m]",
         "Evaluate checkpoints. How often they collide, where they err, and how they compare on the same starts.",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -67,10 +68,10 @@ def head(settings: TrainSettings) -> dict[str, Any]:
     }
 
 
-def train(settings: TrainSettings, results: Results) -> None:
-    """One run; its folder gets best.ckpt, last.ckpt, metrics and results.json."""
+def train(settings: TrainSettings, results: Results, further: Sequence[L.Callback] = ()) -> None:
+    """One run; its folder gets best.ckpt, last.ckpt, metrics and results.json. Further callbacks may watch it."""
     folder = results.path.parent
-    fitted = train_operator(settings, folder, results)
+    fitted = train_operator(settings, folder, results, further)
     policy, chosen = load_policy(fitted.checkpoint), settings.evaluation
     types = [*policy.types, *unseen_types(policy.game, chosen.types, "evaluation.types")]
     models = [(str(results.content["checkpoint"]), policy)]
@@ -82,7 +83,9 @@ def train(settings: TrainSettings, results: Results) -> None:
     publish(fitted.trainer.loggers, results.content, folder, fitted.trainer.global_step)
 
 
-def train_operator(settings: TrainSettings, folder: Path, results: Results) -> Fitted:
+def train_operator(
+    settings: TrainSettings, folder: Path, results: Results, further: Sequence[L.Callback] = ()
+) -> Fitted:
     """Solve labels and train; the folder gets `last.ckpt` and `best.ckpt`, the results how it went and which to use."""
     L.seed_everything(settings.seed, verbose=False)
     use_threads(settings.trainer.threads)
@@ -100,9 +103,11 @@ def train_operator(settings: TrainSettings, folder: Path, results: Results) -> F
             chosen = chosen_callbacks(settings)
             watching = [StepLines(settings.trainer.print_every, update), *rates(makers, chosen)]
             watching += [Film(folder)] if settings.evaluation.landscape else []
+            watching += further
             fitted = fit(
                 operator, objective, data, how_to_train(settings), folder, validation=first, later=later,
-                record=record_of(settings, built), loggers=makers, callbacks=[*chosen, *watching], resume=resume,
+                record=record_of(settings, built), loggers=makers, callbacks=[*chosen, *watching],
+                resume=resume,
             )  # fmt: skip
     except DivergedError:
         if (folder / BEST).exists():
