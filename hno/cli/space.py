@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import IntervalSweep, Override, RangeSweep
+from hydra.core.override_parser.types import ChoiceSweep, IntervalSweep, Override, RangeSweep
 from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution, IntDistribution
 
 from hno.cli.arguments import UsageError
@@ -30,9 +30,10 @@ class Space(NamedTuple):
         return [*self.fixed, *(f"{key}={chosen[name]}" for name, key in self.keys.items())]
 
     def corners(self) -> list[list[str]]:
-        """Command lines of which some has every choice; between the ends of a range nothing new is to be chosen."""
-        first = {name: _ends(axis)[0] for name, axis in self.axes.items()}
-        return [self.words({**first, name: end}) for name, axis in self.axes.items() for end in _ends(axis)]
+        """Command lines of which some has every choice; numbers of a range are all alike here."""
+        first = {name: _choices(axis)[0] for name, axis in self.axes.items()}
+        others = [(name, choice) for name, axis in self.axes.items() for choice in _choices(axis)[1:]]
+        return [self.words(first), *(self.words({**first, name: choice}) for name, choice in others)]
 
 
 def space(words: Sequence[str]) -> Space:
@@ -67,7 +68,7 @@ def space(words: Sequence[str]) -> Space:
 
 def _axis(override: Override) -> BaseDistribution:
     sweep: Any = override.value()
-    if override.is_choice_sweep():
+    if isinstance(sweep, ChoiceSweep):
         return CategoricalDistribution(list(override.sweep_string_iterator()))
     if not isinstance(sweep, (IntervalSweep, RangeSweep)):
         raise ValueError("name its choices, a,b")
@@ -86,8 +87,8 @@ def _axis(override: Override) -> BaseDistribution:
     return FloatDistribution(low, high, log, step)
 
 
-def _ends(axis: Any) -> Sequence[Any]:
-    return axis.choices if isinstance(axis, CategoricalDistribution) else (axis.low, axis.high)
+def _choices(axis: Any) -> Sequence[Any]:
+    return axis.choices if isinstance(axis, CategoricalDistribution) else (axis.low,)
 
 
 def said(axis: Any) -> str:

@@ -26,6 +26,7 @@ def said(study: Study) -> str:
     text = f"{counted(len(study.trials), 'trial')}: {ends}."
     if study.importance:
         shares = ", ".join(f"{name} {percent(share, 0)}" for name, share in study.importance.items())
+        shares = shares.replace(" %", "\u00a0%")
         text += f" What the best tenth of trials by {study.objectives[0]} has in common (PED-ANOVA): {shares}."
     return text
 
@@ -71,13 +72,13 @@ def over_trials(data: Any) -> Layers:
         ),
         tooltip="tip:N",
     )
-    y = alt.Y("value:Q", title=None, scale=alt.Scale(zero=False), axis=alt.Axis(format="~g", tickCount=4, grid=False))
+    y = alt.Y("value:Q", title=None, scale=alt.Scale(zero=False), axis=alt.Axis(format=".3~g", tickCount=4, grid=False))
     measured = base.transform_filter("isValid(datum.value)").encode(y=y)
     line = base.transform_filter("isValid(datum.so_far)").mark_line(
         interpolate="step-after", strokeWidth=1.4, color=alt.expr("muted")
     )
     none = base.transform_filter("!isValid(datum.value)").mark_point(
-        shape="cross", angle=45, size=40, strokeWidth=1, color=alt.expr("datum.state === 'failed' ? danger : muted")
+        shape="cross", angle=45, filled=True, size=45, color=alt.expr("datum.state === 'failed' ? danger : muted")
     )
     return (
         alt.layer(
