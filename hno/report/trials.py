@@ -72,7 +72,7 @@ def over_trials(data: Any) -> Layers:
         ),
         tooltip="tip:N",
     )
-    y = alt.Y("value:Q", title=None, scale=alt.Scale(zero=False), axis=alt.Axis(format=".3~g", tickCount=4, grid=False))
+    y = alt.Y("value:Q", title=None, scale=alt.Scale(zero=False), axis=alt.Axis(format=".5~g", tickCount=4, grid=False))
     measured = base.transform_filter("isValid(datum.value)").encode(y=y)
     line = base.transform_filter("isValid(datum.so_far)").mark_line(
         interpolate="step-after", strokeWidth=1.4, color=alt.expr("muted")
