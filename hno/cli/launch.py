@@ -113,10 +113,8 @@ def _multirun(task: Task, given: Arguments, before: Path | None) -> int:
         if before is not None:
             again.check_same(before, task.command, words)
         register_plugins()
-        if task.search is not None:
-            task.search.check(words, dry)
-            if dry:
-                return 0
+        if task.search is not None and task.search.check(words, dry):
+            return 0
         with tempfile.TemporaryDirectory() as nowhere, ExitStack() as stack:
             folder = Path(nowhere) if dry else _chosen("hydra.sweep.dir", given, HydraConfig.get().sweep.dir)
             stack.enter_context(owned(folder, None if before is None else str(folder), jobs=True))

@@ -30,8 +30,8 @@ class JobSearch(Protocol):
     def command(self) -> str:
         """Its command."""
 
-    def check(self, words: Sequence[str], dry: bool) -> None:
-        """Judge a command line before anything is written; print what a dry one would do."""
+    def check(self, words: Sequence[str], dry: bool) -> bool:
+        """Judge a command line before anything is written; whether that was all, since a dry one is printed."""
 
     def run(self, name: str, job: Callable[[DictConfig], Any], words: Sequence[str]) -> None:
         """Let a launcher run jobs of a root configuration."""

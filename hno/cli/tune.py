@@ -77,12 +77,15 @@ class Searching(NamedTuple):
     search: Search
     command: str = "tune"
 
-    def check(self, words: Sequence[str], dry: bool) -> None:
+    def check(self, words: Sequence[str], dry: bool) -> bool:
         """Refuse a search that makes no sense, before anything is written; a dry one is printed.
 
         Args:
             words: of the command line, as Hydra takes them.
             dry: whether to print it.
+
+        Returns:
+            Whether that was all.
 
         Raises:
             UsageError: with the reason.
@@ -109,6 +112,7 @@ class Searching(NamedTuple):
             axes = [f"  {name}: {said(axis)}" for name, axis in found.axes.items()]
             heading = f"{counted(self.search.trials, 'trial')} by {self.search.search.name} of"
             print("\n".join([heading, *axes, f"to minimise {', '.join(objectives)}"]))
+        return dry
 
     def run(self, name: str, job: Callable[[DictConfig], Any], words: Sequence[str]) -> None:
         """Launch trials until the study has enough of them.
