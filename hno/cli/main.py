@@ -35,6 +35,20 @@ class Command(NamedTuple):
 
 JOBS = tuple(name for name in FLAGS if name not in ("--help", "--version", "--no-window"))
 FOLDERS = ("hydra.run.dir", "hydra.sweep.dir")
+SEARCHED = """
+  key=a,b                     one of these
+  'key=range(8,65,8)'         8, 16, ..., 64
+  'key=interval(0,1)'         a number between; 'key=int(interval(1,9))': a whole one
+  'key=tag(log,interval(1e-4,1e-2))'
+
+  objective=[a,b]             numbers of results.json that are minimised, one or several
+  trials=20                   of the whole study
+  search=tpe                  who proposes: tpe, random, nsga2, gp; search.seed=0, search.<option of Optuna's>
+  pruner=median               ends hopeless runs: median, halving; pruner.<option of Optuna's>
+  at_once=4                   trials that are launched together; by default as many as joblib has processes, or 1
+  storage=URL study=NAME      a database that machines share; by default study.db in the folder
+  sweep=FOLDER                go on with the search there""".strip("\n")
+"""Words of `hno tune`."""
 COMMANDS = {
     "train": Command(
         "hno.cli.train:run", "[group=choice ...] [key=value ...] [-m]",
@@ -43,11 +57,7 @@ COMMANDS = {
     ),
     "tune": Command(
         "hno.cli.tune:run", "key=interval(A,B) key=a,b ... [key=value ...] [trials=20] [storage=URL study=NAME]",
-        "Search settings of a training with Optuna. Searched is what a sweep could be over: key=a,b, "
-        "'key=range(1,9)', 'key=interval(0,1)', 'key=tag(log,interval(1e-4,1e-2))'; objective=[a,b] are minimised "
-        "together. trials=20: of the whole study; at_once=<as many as the launcher runs>; search=tpe|random|nsga2|gp, "
-        "search.seed=0; pruner=median|halving: ends hopeless runs; search.<option>, pruner.<option>: Optuna's; "
-        "sweep=FOLDER: go on. The keys are those of hno train.",
+        f"Search settings of a training with Optuna. Keys are those of hno train; searched are\n{SEARCHED}",
         "train", to=FOLDERS, flags=("--dry-run", "--to", "--config-dir", "--shell-completion"),
     ),
     "evaluate": Command(
