@@ -20,10 +20,10 @@ from hno.cli.perform import Task, perform
 from hno.cli.pruning import Pruning
 from hno.cli.results import PrunedError, Results
 from hno.cli.resume import own_configuration
-from hno.cli.search import Search, judged, taken
+from hno.cli.search import Proposer, Search, judged, taken
 from hno.cli.settings import TrainSettings
 from hno.cli.space import space
-from hno.cli.study import Trials, check_asked, opened
+from hno.cli.study import PROPOSERS, ByNumber, Trials, check_asked, opened
 from hno.training.validation import ClosedLoopValidation, Score
 from tests.cli.conftest import SMOKE, Command, refused
 
@@ -229,6 +229,25 @@ def test_without_optuna_one_sentence_says_how_to_install_it(command: Command, mo
 def test_a_storage_that_cannot_be_used_is_named(command: Command, tmp_path: Path) -> None:
     words = (f"storage=sqlite:///{tmp_path}/no/where.db", "study=mine", "--to", str(tmp_path / "run"))
     refused(command("tune", *SMOKE, LR, *words, folder="none"), "The study cannot be kept in", "unable to open")
+
+
+@pytest.mark.parametrize("name", [*PROPOSERS])
+def test_what_is_proposed_follows_from_the_seed_the_number_and_the_ends_of_others(name: str) -> None:
+    def xs(count: int, study: optuna.Study) -> list[float]:
+        for _ in range(count):
+            trial = study.ask({"x": FloatDistribution(0, 1)})
+            study.tell(trial, (trial.params["x"] - 0.3) ** 2)
+        return [trial.params["x"] for trial in study.trials]
+
+    def sampler(seed: int) -> ByNumber:
+        return ByNumber(Proposer(name=name, seed=seed))
+
+    study = optuna.create_study(sampler=sampler(1))
+    xs(6, study)
+    study.sampler = sampler(1)  # as in a process that goes on
+    assert len(set(xs(6, study))) == 12
+    assert xs(0, study) == xs(12, optuna.create_study(sampler=sampler(1)))
+    assert xs(1, optuna.create_study(sampler=sampler(2))) != xs(0, study)[:1]
 
 
 def trials(search: Search, folder: Path, mark: str) -> Trials:
