@@ -11,7 +11,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-OPTIONAL = {"episodes", "export", "report"}
+OPTIONAL = {"episodes", "export", "report", "tune"}
 """Extras whose libraries hno imports where they are installed."""
 
 

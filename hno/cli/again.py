@@ -111,16 +111,20 @@ def check_same(folder: Path, command: str, words: Iterable[str]) -> None:
     before = begun(folder)
     if before.command != command:
         raise UsageError(f"{folder} is a sweep of hno {before.command}, not of hno {command}.")
-    was, now = (_asked(found) for found in ([*before.words, *before.hydra], words))
-    if differing := sorted(key for key in was.keys() | now.keys() if was.get(key) != now.get(key)):
-        pairs = "\n".join(f"  {key}: {was.get(key, 'not given')}, now {now.get(key, 'not given')}" for key in differing)
+    if pairs := differing(asked([*before.words, *before.hydra]), asked(words)):
         raise UsageError(
             f"{folder} is another sweep:\n{pairs}\nGive the same words again, or none but sweep=<folder>; or begin a "
             "sweep of its own, without sweep=."
         )
 
 
-def _asked(words: Iterable[str]) -> dict[str, str]:
+def differing(was: Mapping[str, str], now: Mapping[str, str]) -> str:
+    """Words of two sweeps that differ, one a line."""
+    keys = sorted(key for key in was.keys() | now.keys() if was.get(key) != now.get(key))
+    return "\n".join(f"  {key}: {was.get(key, 'not given')}, now {now.get(key, 'not given')}" for key in keys)
+
+
+def asked(words: Iterable[str]) -> dict[str, str]:
     """What decides which jobs a sweep has and what they do, by key."""
     return {_key(word): word.partition("=")[2] for word in words if _identifies(word)}
 
@@ -150,13 +154,13 @@ def planned(folder: Path, settings: Settings, reads: Sequence[Path] = ()) -> str
         return REPEATED if (folder / RESULTS).exists() else NEW
     if found["status"] == "failed":
         return REPEATED
-    if differing := {key: pair for key, pair in changes(settings, found).items() if key not in HERE}:
-        pairs = "\n".join(f"  {key}: {was!r}, now {now!r}" for key, (was, now) in differing.items())
+    if changed := {key: pair for key, pair in changes(settings, found).items() if key not in HERE}:
+        pairs = "\n".join(f"  {key}: {was!r}, now {now!r}" for key, (was, now) in changed.items())
         raise SettingsError(
             f"The job in {folder} is {found['status']} with other settings, which a file of the configuration has "
             f"changed since:\n{pairs}\nBring it back as it was, or begin a sweep of its own, without sweep=."
         )
-    if found["status"] == "finished":
+    if found["status"] in ("finished", "pruned"):
         since = (folder / RESULTS).stat().st_mtime
         return REPEATED if any(path.stat().st_mtime > since for path in reads) else SKIPPED
     return RESUMED_JOB if "resume" in type(settings).model_fields and _can_go_on(folder) else REPEATED

@@ -110,8 +110,10 @@ def _multirun(task: Task, given: Arguments, before: Path | None) -> int:
         words, cores = [*words, *folders_named(words, groups(task.name))], share()
         check_cluster()
         if before is not None:
-            again.check_same(before, task.name, words)
+            again.check_same(before, task.command, words)
         register_plugins()
+        if task.search is not None and task.search.check(words, dry):
+            return 0
         with tempfile.TemporaryDirectory() as nowhere, ExitStack() as stack:
             folder = Path(nowhere) if dry else _chosen("hydra.sweep.dir", given, HydraConfig.get().sweep.dir)
             stack.enter_context(owned(folder, None if before is None else str(folder), jobs=True))
@@ -128,7 +130,8 @@ def _swept(task: Task, words: Sequence[str], made: AbstractContextManager[Ledger
     own = {kind: registry().own() for kind, registry in REGISTRIES.items()}
     failure, queued = None, in_queue()
     with made as ledger:
-        command = again.command(task.name, ledger.sweep)
+        command = again.command(task.command, ledger.sweep)
+        runs = under_hydra if task.search is None else task.search.run
 
         def job(config: DictConfig) -> Objective:  # a launcher may send it to another process
             follow(ledger.process)
@@ -137,7 +140,7 @@ def _swept(task: Task, words: Sequence[str], made: AbstractContextManager[Ledger
 
         try:
             with passed_on(ledger.pass_on):
-                under_hydra(task.name, job, words)
+                runs(task.name, job, words)
         except Exception as error:
             if isinstance(error, REFUSALS) and not ledger.entries():
                 raise
@@ -147,7 +150,7 @@ def _swept(task: Task, words: Sequence[str], made: AbstractContextManager[Ledger
         finally:
             found = ledger.entries()
             if found and not dry:
-                whole = failure is None and all(entry.succeeded for entry in found)
+                whole = failure is None and (task.search is not None or all(entry.succeeded for entry in found))
                 show_jobs([entry.job for entry in found], None if whole else command)
         if ledger.signal is not None:
             stop = Interrupted(ledger.signal)
@@ -159,7 +162,8 @@ def _swept(task: Task, words: Sequence[str], made: AbstractContextManager[Ledger
     if failure is not None:
         on = " Those that are in the queue go on without it." if queued else ""
         print(f"The launcher ended before all jobs did: {one_screen(sentence(failure))}{on}", file=sys.stderr)
-    return 1 if refused or failure is not None else 0
+    failed = refused if task.search is None else failure is None and not task.search.succeeded(ledger.sweep)
+    return 1 if failed or failure is not None else 0
 
 
 def _job(task: Task, config: DictConfig, ledger: Ledger, own: Parts, dry: bool) -> Objective:

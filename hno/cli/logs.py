@@ -133,7 +133,7 @@ def finish_wandb(results: Mapping[str, Any], folder: Path) -> None:
         wandb.run.log_artifact(_artifact(wandb, results, folder))
     except Exception as error:  # what W&B refuses costs no run its results
         log.warning("W&B did not take the files of the run: %s", error)
-    wandb.finish(exit_code=int(results["status"] != "finished"))
+    wandb.finish(exit_code=int(results["status"] not in ("finished", "pruned")))
 
 
 def _artifact(wandb: Any, results: Mapping[str, Any], folder: Path) -> Any:

@@ -35,11 +35,30 @@ class Command(NamedTuple):
 
 JOBS = tuple(name for name in FLAGS if name not in ("--help", "--version", "--no-window"))
 FOLDERS = ("hydra.run.dir", "hydra.sweep.dir")
+SEARCHED = """
+  key=a,b                     one of these
+  'key=range(8,65,8)'         8, 16, ..., 64
+  'key=interval(0,1)'         a number between; 'key=int(interval(1,9))': a whole one
+  'key=tag(log,interval(1e-4,1e-2))'
+
+  objective=[a,b]             numbers of results.json that are minimised, one or several
+  trials=20                   of the whole study
+  search=tpe                  who proposes: tpe, random, nsga2, gp; search.seed=0, search.<option of Optuna's>
+  pruner=median               ends hopeless runs: median, halving; pruner.<option of Optuna's>
+  at_once=4                   trials that are launched together; by default as many as joblib has processes, or 1
+  storage=URL study=NAME      a database that machines share; by default study.db in the folder
+  sweep=FOLDER                go on with the search there""".strip("\n")
+"""Words of `hno tune`."""
 COMMANDS = {
     "train": Command(
         "hno.cli.train:run", "[group=choice ...] [key=value ...] [-m]",
         "Solve labels, train an operator and evaluate it. The run's folder gets checkpoints, metrics and results.json.",
         "train", to=FOLDERS, flags=JOBS,
+    ),
+    "tune": Command(
+        "hno.cli.tune:run", "key=interval(A,B) key=a,b ... [key=value ...] [trials=20] [storage=URL study=NAME]",
+        f"Search settings of a training with Optuna. Keys are those of hno train; searched are\n{SEARCHED}",
+        "train", to=FOLDERS, flags=("--dry-run", "--to", "--config-dir", "--shell-completion"),
     ),
     "evaluate": Command(
         "hno.cli.evaluate:run", "checkpoint=FILE [key=value ...] [-m]",

@@ -7,7 +7,7 @@ import shlex
 import traceback
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 from hydra.core.hydra_config import HydraConfig
 from lightning.fabric.utilities.exceptions import MisconfigurationException
@@ -16,7 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 import hno
 from hno.cli.logs import finish_wandb, refuse_wandb
 from hno.cli.progress import collect_messages
-from hno.cli.results import Results, recorded
+from hno.cli.results import PrunedError, Results, recorded
 from hno.cli.sections import show
 from hno.evaluation.format import NAMES
 from hno.processes import Interrupted
@@ -24,6 +24,23 @@ from hno.registry import UnknownNameError
 from hno.report.runs import RESULTS
 
 log = logging.getLogger(__name__)
+
+
+class JobSearch(Protocol):
+    """What chooses the jobs of a multirun where they are no grid."""
+
+    @property
+    def command(self) -> str:
+        """Its command."""
+
+    def check(self, words: Sequence[str], dry: bool) -> bool:
+        """Judge a command line before anything is written; whether that was all, since a dry one is printed."""
+
+    def run(self, name: str, job: Callable[[DictConfig], Any], words: Sequence[str]) -> None:
+        """Let a launcher run jobs of a root configuration."""
+
+    def succeeded(self, folder: Path) -> bool:
+        """Whether what is in the folder of the sweep is worth something, though some of its jobs failed."""
 
 
 class Task(NamedTuple):
@@ -39,13 +56,20 @@ class Task(NamedTuple):
     """Does the job, from the settings."""
     reads: Callable[[Any], Sequence[Path]] = lambda settings: ()
     """Files whose change makes results that are older worthless, from the settings."""
+    search: JobSearch | None = None
+    """What chooses the jobs of a multirun; None for Hydra's grid."""
+
+    @property
+    def command(self) -> str:
+        """What a multirun of it goes on with."""
+        return self.name if self.search is None else self.search.command
 
 
 def perform(task: Task, settings: Any, folder: Path) -> Results | None:
     """Do one job; its folder gets results.json.
 
     Returns:
-        What came of it; None where it failed, which has been logged and is in its folder.
+        What came of it, also where it was pruned; None where it failed, which has been logged and is in its folder.
     """
     collect_messages()
     results = Results(folder / RESULTS, task.head(settings))
@@ -56,6 +80,9 @@ def perform(task: Task, settings: Any, folder: Path) -> Results | None:
         if hasattr(settings, "resume"):
             stop.add_note(f"Go on with: hno train resume={shlex.quote(str(folder))}")
         raise
+    except PrunedError as stop:
+        log.info("%s", stop)
+        return results
     except Exception as error:
         _log(error)
         return None

@@ -18,6 +18,10 @@ from hno.processes import Interrupted
 PACKAGES = ("torch", "lightning", "torchmetrics", "hydra-core", "omegaconf", "wandb", "scipy", "safetensors")
 
 
+class PrunedError(RuntimeError):
+    """A run is ended because it is hopeless beside others: it has neither failed nor finished."""
+
+
 def versions() -> dict[str, str]:
     """Versions of hno, Python and the packages that numbers depend on."""
     found = {"hno": hno.__version__, "python": platform.python_version()}
@@ -75,7 +79,7 @@ class Results:
 
 @contextmanager
 def recorded(results: Results) -> Iterator[None]:
-    """Work whose end is in the results: that it is finished, which signal interrupted it, or why it failed."""
+    """Work whose end is in the results: finished, interrupted by which signal, or why it failed or was pruned."""
     try:
         yield
     except Interrupted as stop:
@@ -83,6 +87,9 @@ def recorded(results: Results) -> Iterator[None]:
         raise
     except (KeyboardInterrupt, SystemExit):  # Lightning turns the one into the other
         results.update(status="interrupted", reason="SIGINT")
+        raise
+    except PrunedError as stop:
+        results.update(status="pruned", reason=str(stop))
         raise
     except BaseException as error:
         results.update(status="failed", reason=f"{type(error).__name__}: {error}")

@@ -29,6 +29,8 @@ from hno.report.runs import LOST, at_work
 
 LOG, PREFIX, LEFT = "sweep.log", ".jobs-", "left"
 """Names in the folder of a sweep: its log, how that of a ledger begins, and what keeps a ledger there."""
+TRIAL = "HNO_TRIAL"
+"""Where a job of a search finds its number: launchers count those of one process."""
 PAUSE = 20.0
 """Time between two pages of a sweep whose jobs fail one after the other, s."""
 NAMED = (*NAMES, "seed")
@@ -56,8 +58,8 @@ class Job(NamedTuple):
         """The one that runs here."""
         hydra = HydraConfig.get()
         settings = tuple(setting.lstrip("+") for setting in hydra.overrides.task)
-        number = 0 if OmegaConf.is_missing(hydra.job, "num") else hydra.job.num
-        return cls(number, Path(hydra.runtime.output_dir), settings)
+        number = hydra.job.env_set.get(TRIAL, 0 if OmegaConf.is_missing(hydra.job, "num") else hydra.job.num)
+        return cls(int(number), Path(hydra.runtime.output_dir), settings)
 
     def results(self) -> dict[str, Any]:
         """Content of its results.json; without one that can be read, a failure; with one that has no end, lost."""

@@ -69,10 +69,10 @@ def head(settings: TrainSettings) -> dict[str, Any]:
     }
 
 
-def train(settings: TrainSettings, results: Results) -> None:
-    """One run; its folder gets best.ckpt, last.ckpt, metrics and results.json."""
+def train(settings: TrainSettings, results: Results, further: Sequence[L.Callback] = ()) -> None:
+    """One run; its folder gets best.ckpt, last.ckpt, metrics and results.json. Further callbacks may watch it."""
     folder = results.path.parent
-    fitted = train_operator(settings, folder, results)
+    fitted = train_operator(settings, folder, results, further)
     policy = load_policy(fitted.checkpoint)
     types = [*policy.types, *unseen_types(policy.game, settings.evaluation.types, "evaluation.types")]
     played, _ = play_starts(described(policy, types, settings, results), results)
@@ -94,7 +94,9 @@ def landscape_of(policy: LearnedPolicy, settings: TrainSettings, results: Result
     return write_landscape(described(policy, policy.types, settings, results), results)
 
 
-def train_operator(settings: TrainSettings, folder: Path, results: Results) -> Fitted:
+def train_operator(
+    settings: TrainSettings, folder: Path, results: Results, further: Sequence[L.Callback] = ()
+) -> Fitted:
     """Solve labels and train; the folder gets `last.ckpt` and `best.ckpt`, the results how it went and which to use."""
     L.seed_everything(settings.seed, verbose=False)
     use_threads(settings.trainer.threads)
@@ -112,6 +114,7 @@ def train_operator(settings: TrainSettings, folder: Path, results: Results) -> F
             chosen = chosen_callbacks(settings)
             watching = [StepLines(settings.trainer.print_every, update), *rates(makers, chosen)]
             watching += [Film(folder)] if settings.evaluation.landscape else []
+            watching += further
             fitted = fit(
                 operator, objective, data, how_to_train(settings), folder, validation=first, later=later,
                 record=record_of(settings, built), loggers=makers, callbacks=chosen, watching=watching, resume=resume,

@@ -10,6 +10,7 @@ import altair as alt
 
 from hno.report import vega
 from hno.report.strips import STRUCK, beliefs, heading, separation, strip
+from hno.report.trials import over_trials
 from hno.report.vega import Layers, colors
 
 LEAST = 0.001
@@ -205,6 +206,7 @@ def specifications() -> dict[str, Any]:
         "heat": heat_map(cells), "comparison": comparison(rows), "log": learning_curves(points, "log"),
         "clearances": clearances(points),
         "linear": learning_curves(points, "linear"), "separation": separation(frames),
-        "beliefs": beliefs(frames), "strip": strip(alt.NamedData("series")),
+        "trials": over_trials(alt.NamedData("trials")), "beliefs": beliefs(frames),
+        "strip": strip(alt.NamedData("series")),
     }  # fmt: skip
     return {name: vega.compiled(chart) for name, chart in charts.items()}

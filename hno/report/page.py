@@ -14,7 +14,7 @@ from markupsafe import Markup
 from hno.data.store import replace_whole
 from hno.evaluation import format as text
 from hno.evaluation.sections import plain
-from hno.report import clearances, landscapes, page_data, vega, verdicts
+from hno.report import clearances, landscapes, page_data, trials, vega, verdicts
 from hno.report.charts import specifications
 from hno.report.parts import Beside, Keep, parts
 from hno.report.recipes import Recipe, best, headline, recipes
@@ -72,6 +72,7 @@ def render(sweep: Sweep, refresh: float | None = None, place: Path | None = None
         "scenes": page_data.scenes(runs),
         "members": {card["id"]: [run.name for run in card["recipe"].runs] for card in cards},
         "landscapes": landscapes.entries(runs, place),
+        "trials": trials.points(sweep.study) if sweep.study else {},
         "charts": {**specifications(), "landscape": landscapes.chart()},
         "themes": {name: {"config": vega.chart_config(name), "signals": vega.signals(name)} for name in vega.THEMES},
         "refresh": refresh,
@@ -84,11 +85,12 @@ def render(sweep: Sweep, refresh: float | None = None, place: Path | None = None
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
     environment.globals |= {"format": text, "verdicts": verdicts, "names_of": names_of}
-    environment.globals["validity"] = validity
+    environment.globals |= {"validity": validity, "trials": trials}
     return environment.get_template("page.html.j2").render(
         sweep=sweep, recipes=found, single=len(runs) == 1,
         games={game: (headline(own), own) for game, own in games.items()}, cards=cards,
-        unfinished=[run for run in runs if not run.finished], filters={name: _choices(runs, name) for name in FILTERS},
+        unfinished=[run for run in runs if not run.finished and (len(runs) == 1 or run.status != "pruned")],
+        filters={name: _choices(runs, name) for name in FILTERS},
         curve_games=sorted({one["game"] for one in curves}),
         near_games=sorted({one["game"] for one in near}), recipe_table=recipe_table(found),
         run_table=run_table(runs), labels=label_tables(runs), sections=[entry for entry in sections if entry[1]],

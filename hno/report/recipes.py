@@ -173,8 +173,8 @@ def _recipe(names: Names, variant: str, runs: Sequence[Run]) -> Recipe:
     finished = [run for run in runs if run.finished]
     counted = tuple({(run.seed, run.test_seed): run for run in finished}.values())
     repeated = tuple(run for run in finished if all(run is not other for other in counted))
-    failed = sum(run.status == "failed" for run in runs)
-    return Recipe(*names, variant, counted, repeated, len(runs) - len(finished) - failed, failed)
+    failed, pruned = (sum(run.status == status for run in runs) for status in ("failed", "pruned"))
+    return Recipe(*names, variant, counted, repeated, len(runs) - len(finished) - failed - pruned, failed)
 
 
 def best(found: Iterable[Recipe]) -> list[Recipe]:

@@ -18,6 +18,9 @@ from hno.evaluation.page_script import check_script
 from hno.evaluation.starts import starts_from
 from hno.report.episode import Scene, episode
 from hno.report.records import Curves, Run, sentence, type_row
+from hno.report.study import FILE as STUDY
+from hno.report.study import Study
+from hno.report.study import read as read_study
 
 T = TypeVar("T")
 RESULTS, METRICS = "results.json", "csv/metrics.csv"
@@ -46,6 +49,8 @@ class Sweep(NamedTuple):
     skipped: tuple[Skipped, ...]
     command: str | None
     """The command line of the whole sweep; None for single runs."""
+    study: Study | None = None
+    """Of a search."""
 
 
 def load(root: Path) -> Sweep:
@@ -70,7 +75,14 @@ def load(root: Path) -> Sweep:
     if not runs:
         found = "; ".join(f"{entry.name}: {entry.reason}" for entry in skipped[:3]) or f"no {RESULTS} in it or below"
         raise NoRunsError(f"{root} holds no run ({found}). Runs are written by train.py and evaluate.py.")
-    return Sweep(root.resolve().name, tuple(runs), tuple(skipped), _command(root / "multirun.yaml", "-m"))
+    study, command = None, _command(root / "multirun.yaml", "-m")
+    try:
+        study = read_study(root / STUDY)
+    except ValueError as error:
+        skipped.append(Skipped(STUDY, str(error)))
+    if study is not None and command is not None:
+        command = f"{command} {shlex.join(study.words)}"
+    return Sweep(root.resolve().name, tuple(runs), tuple(skipped), command, study)
 
 
 def _candidates(root: Path) -> list[Path]:
@@ -208,7 +220,8 @@ def _command(path: Path, *flags: str) -> str | None:
     """The command line of a job or a sweep from a file of Hydra's; None where that is missing or damaged."""
     try:
         hydra = safe_load(path.read_text(encoding="utf-8"))["hydra"]
-        script = f"{hydra.get('job', {}).get('name', 'train')}.py"
-        return shlex.join(["python", script, *flags, *map(str, hydra["overrides"]["task"])])
+        name = hydra.get("job", {}).get("name", "train")
+        how = ["hno", "tune"] if name == "tune" else ["python", f"{name}.py", *flags]
+        return shlex.join([*how, *map(str, hydra["overrides"]["task"])])
     except (OSError, ValueError, TypeError, LookupError, AttributeError, YAMLError):
         return None

@@ -39,8 +39,8 @@ def over_seeds(found: Spread | None) -> str:
 def jobs(sweep: Sweep) -> str:
     """How many jobs ended how."""
     finished = sum(run.finished for run in sweep.runs)
-    failed = sum(run.status == "failed" for run in sweep.runs)
-    counts = {"failed": failed, "unfinished": len(sweep.runs) - finished - failed}
+    counts = {status: sum(run.status == status for run in sweep.runs) for status in ("failed", "pruned")}
+    counts["unfinished"] = len(sweep.runs) - finished - sum(counts.values())
     said = [f"{finished} finished", *(f"{count} {state}" for state, count in counts.items() if count > 0)]
     said += [f"{counted(len(sweep.skipped), 'folder')} skipped"] if sweep.skipped else []
     return f"{counted(len(sweep.runs), 'run')}: {', '.join(said)}."

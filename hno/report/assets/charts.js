@@ -118,7 +118,11 @@ function meaning(metric) {
   return (known.find(([start]) => metric.startsWith(start)) ?? ["", "as logged"])[1];
 }
 
-const kinds = { heat: drawHeat, comparison: drawComparison, clearances: drawClearances, curves: drawCurves };
+function drawTrials(host) {
+  draw(host, "trials", { trials: DATA.trials[host.dataset.of] }, { objective: host.dataset.of });
+}
+
+const kinds = { heat: drawHeat, comparison: drawComparison, clearances: drawClearances, curves: drawCurves, trials: drawTrials };
 const pending = new Set(all("[data-chart]"));
 const visible = new Set();
 
