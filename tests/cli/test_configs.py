@@ -48,7 +48,7 @@ def data_of(chosen: TrainSettings) -> GameData:
 @pytest.mark.parametrize(("group", "choice"), CHOICES)
 def test_every_choice_of_every_group_composes(group: str, choice: str, monkeypatch: pytest.MonkeyPatch) -> None:
     if choice in ("gpu", "mps"):  # refused where there is none
-        monkeypatch.setattr("hno.cli.build._check_device", lambda settings: None)
+        monkeypatch.setattr("hno.cli.build._check_devices", lambda settings, built: None)
     settings(f"{group}={choice}")
 
 

@@ -17,6 +17,7 @@ from hno.cli.arguments import Arguments
 from hno.cli.config import read
 from hno.cli.help import configuration_help
 from hno.cli.objective import objective
+from hno.cli.results import Results
 from hno.cli.resume import training_hash
 from hno.cli.settings import COMMANDS, TrainSettings
 from hno.training.callbacks import callbacks
@@ -121,15 +122,13 @@ def test_a_run_that_stops_early_is_finished(command: Command) -> None:
 def test_a_job_returns_the_chosen_numbers(wanted: Any, expected: Any) -> None:
     content = {"metrics": {"val/value_error": 0.5, "loss/total": 2.0}, "table": [], "seconds": {}}
     content["validation"] = {"collision_rate": 0.0, "excess": 0.1}
-    results: Any = SimpleNamespace(content=content)
-    assert objective(SimpleNamespace(objective=wanted), results) == expected
+    assert objective(SimpleNamespace(objective=wanted), content) == expected
+    assert objective(SimpleNamespace(objective=wanted), content | {"status": "pruned"}) is None
 
 
-def test_a_failed_job_and_one_without_the_number_return_none(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_job_without_the_number_returns_none(caplog: pytest.LogCaptureFixture) -> None:
     wanted = SimpleNamespace(objective="test/collision_rate")
-    assert objective(wanted, None) is None
-    results: Any = SimpleNamespace(content={"metrics": {"loss/total": 2.0}, "table": [], "seconds": {}})
-    assert objective(wanted, results) is None
+    assert objective(wanted, {"metrics": {"loss/total": 2.0}, "table": [], "seconds": {}}) is None
     assert "no number test/collision_rate; it has loss/total" in caplog.text
 
 
@@ -137,8 +136,11 @@ def test_the_sweeper_sees_what_jobs_return(command: Command, monkeypatch: pytest
     seen, original = list[Any](), launch.under_hydra
 
     def performed(task: Any, chosen: TrainSettings, folder: Path) -> Any:
-        content = {"metrics": {"loss/total": float(chosen.seed)}, "table": [], "seconds": {}}
-        return SimpleNamespace(content=content) if chosen.seed else None
+        metrics = {"loss/total": float(chosen.seed)}
+        status = "finished" if chosen.seed else "failed"
+        results = Results(folder / "results.json", {"metrics": metrics, "table": [], "seconds": {}})
+        results.update(status=status, reason=None)
+        return results if chosen.seed else None
 
     def under_hydra(name: str, job: Any, words: Any) -> None:
         original(name, lambda config: seen.append(job(config)), words)

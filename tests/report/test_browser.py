@@ -232,11 +232,11 @@ def test_a_cell_of_a_heat_map_opens_its_episodes_and_the_address_keeps_the_view(
     theta = page.input_value("#types")
     assert all(f" {theta} " in title for title in titles(page))
     page.click("#next")
-    chosen = page.locator("#episode option:checked").inner_text()
+    chosen = page.locator("#episode option:checked").text_content()
     browser.meet(chosen)
     move_to(page, 0.75)
     page.reload()
-    assert page.locator("#episode option:checked").inner_text() == chosen
+    assert page.locator("#episode option:checked").text_content() == chosen
     assert page.input_value("#types") == theta
     browser.meet()
     browser.until("document.querySelector('#clock').textContent.startsWith('0.75 s')")
@@ -252,10 +252,10 @@ def test_two_policies_from_one_start_are_drawn_over_each_other(context, tmp_path
         (folder / "episodes.json").write_text(json.dumps({"episodes": [entry], "scene": scene}))
     write_page(load(tmp_path), tmp_path / "report.html")
     opened = Browser(context, (tmp_path / "report.html").as_uri())
-    assert opened.page.locator("#beside option").all_inner_texts() == ["nothing", "run_1"]
+    assert opened.page.locator("#beside option").all_text_contents() == ["nothing", "run_1"]
     opened.meet()
-    assert "left one, θ = 1" in opened.page.inner_text("#who")
-    assert "Bodies are drawn for the eye." in opened.page.inner_text("#drawn")
+    assert "left one, θ = 1" in opened.page.text_content("#who")
+    assert "Bodies are drawn for the eye." in opened.page.text_content("#drawn")
     alone = opened.page.evaluate("document.querySelector('#top canvas').toDataURL()")
     opened.page.select_option("#beside", label="run_1")
     beside = "document.querySelector('#said').textContent.includes('Beside it: run_1')"
@@ -292,10 +292,10 @@ def test_the_clock_says_which_branch_is_played(context, tmp_path):
     opened = Browser(context, (tmp_path / "report.html").as_uri())
     opened.meet()
     opened.until("document.querySelector('#clock').textContent === '1.50 s, branch 1'")
-    assert "Passes on the other side than the equilibrium." in opened.page.inner_text("#said")
+    assert "Passes on the other side than the equilibrium." in opened.page.text_content("#said")
     opened.page.click("#next")
     opened.until("document.querySelector('#clock').textContent === '1.50 s'")
-    assert "other side" not in opened.page.inner_text("#said")
+    assert "other side" not in opened.page.text_content("#said")
     assert opened.said == []
     opened.page.close()
 

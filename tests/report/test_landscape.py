@@ -128,10 +128,10 @@ def test_the_page_shows_values_equilibria_and_errors_from_a_file_beside_it(conte
     browser = opened(context, tmp_path)
     page = browser.page
     page.locator("#land-error canvas").wait_for()
-    said = page.inner_text("#land-said")
+    said = page.text_content("#land-said")
     assert "Evaluated in this page" in said
     assert "24 of 25 points have an equilibrium" in said
-    assert page.locator("#land-shown option").all_inner_texts()[:3] == ["W", "V1", "V2"]
+    assert page.locator("#land-shown option").all_text_contents()[:3] == ["W", "V1", "V2"]
     page.locator("#land-truth canvas").hover(position={"x": 120, "y": 80})
     browser.until("/^gap .* m, offset .* m: W -?[0-9.]+$/.test(document.querySelector('#land-at').textContent)")
     for label in ("V2", "∂W/∂v_1"):
@@ -160,7 +160,7 @@ def test_the_film_shows_the_slice_after_every_validation(context, content, tmp_p
     browser = opened(context, tmp_path)
     page = browser.page
     page.locator("#land-learned canvas").wait_for()
-    assert page.inner_text("#land-film-step") == "step 30"
+    assert page.text_content("#land-film-step") == "step 30"
     page.select_option("#land-up", "v_2")
     page.locator("#land-film").fill("1")
     browser.until("document.querySelector('#land-said').textContent.includes('W after step 20, frame 2 of 3')")
@@ -184,7 +184,7 @@ def test_without_a_graph_the_page_shows_pythons_values_and_says_so(context, cont
     run_with(tmp_path, {**content, "program": None, "reason": "UnsupportedError: aten.cumsum cannot be exported"})
     browser = opened(context, tmp_path)
     browser.page.locator("#land-error canvas").wait_for()
-    assert "cannot evaluate the controller (UnsupportedError: aten.cumsum" in browser.page.inner_text("#land-said")
+    assert "cannot evaluate the controller (UnsupportedError: aten.cumsum" in browser.page.text_content("#land-said")
     assert browser.page.locator("#land-sliders input").first.is_disabled()
     assert browser.page.locator("#land-across").is_disabled()
     assert browser.said == []
@@ -196,7 +196,7 @@ def test_a_page_that_is_not_what_python_says_shows_pythons_values(context, conte
     run_with(tmp_path, wrong)
     browser = opened(context, tmp_path)
     browser.page.locator("#land-error canvas").wait_for()
-    assert "more than 1 %" in browser.page.inner_text("#land-said")
+    assert "more than 1 %" in browser.page.text_content("#land-said")
     browser.page.close()
 
 
@@ -207,7 +207,7 @@ def test_a_file_that_has_gone_is_named(context, content, tmp_path):  # noqa: F81
     browser = Browser(context, (tmp_path / "report.html").as_uri())
     browser.page.locator("#landscape").scroll_into_view_if_needed()
     browser.until("document.querySelector('#land-said').textContent.includes('cannot be loaded')")
-    assert "keep the folder of one beside this page" in browser.page.inner_text("#land-said")
+    assert "keep the folder of one beside this page" in browser.page.text_content("#land-said")
     browser.page.close()
 
 
