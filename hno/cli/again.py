@@ -188,6 +188,6 @@ def clear(folder: Path) -> None:
         (folder / name).unlink(missing_ok=True)
 
 
-def command(task: str, folder: Path) -> str:
-    """The command that goes on with a sweep."""
-    return f"hno {task} sweep={shlex.quote(str(folder))}"
+def command(task: str, folder: Path, place: Sequence[str] = ()) -> str:
+    """The command that goes on with a sweep, with words that have to be given again."""
+    return shlex.join(["hno", task, f"sweep={folder}", *place])

@@ -130,7 +130,7 @@ def _swept(task: Task, words: Sequence[str], made: AbstractContextManager[Ledger
     own = {kind: registry().own() for kind, registry in REGISTRIES.items()}
     failure, queued = None, in_queue()
     with made as ledger:
-        command = again.command(task.command, ledger.sweep)
+        command = again.command(task.command, ledger.sweep, () if task.search is None else task.search.place)
         runs = under_hydra if task.search is None else task.search.run
 
         def job(config: DictConfig) -> Objective:  # a launcher may send it to another process

@@ -33,6 +33,10 @@ class JobSearch(Protocol):
     def command(self) -> str:
         """Its command."""
 
+    @property
+    def place(self) -> Sequence[str]:
+        """Words of the command line that no file may say: they are given again where it goes on."""
+
     def check(self, words: Sequence[str], dry: bool) -> bool:
         """Judge a command line before anything is written; whether that was all, since a dry one is printed."""
 

@@ -132,9 +132,32 @@ def before(folder: Path) -> dict[str, Any]:
         UsageError: it is none.
     """
     try:
-        return {**read_json(folder / STUDY)}
+        content = read_json(folder / STUDY)
+        if not (isinstance(content.get("mark"), str) and isinstance(content.get("search"), dict)):
+            raise ValueError("it says nothing of the search")
+        return content
     except ValueError as error:
         raise UsageError(
             f"There is no search to go on with in {folder}: {error}. sweep=<folder> takes the folder of an earlier "
             "`hno tune`, such as multirun/<date>/<time>."
         ) from error
+
+
+def same_place(said: Mapping[str, Any], words: Mapping[str, Any]) -> dict[str, Any]:
+    """What the folder of a search says of it, for a search that goes on where its trials are kept.
+
+    Raises:
+        UsageError: that is a database and is not named again: a folder may be from somebody else, and a file of it is
+            not to choose what is opened; or another place is named.
+    """
+    was = judged({key: value for key, value in said.items() if said.get("storage") or key != "study"})
+    if was.storage is None:
+        if moved := [key for key in ("storage", "study") if key in words and words[key] != getattr(was, key)]:
+            raise UsageError(f"A search goes on with the study that it has: leave {moved[0]}= out.")
+        return was.model_dump(exclude={"storage", "study"})
+    if (words.get("storage"), words.get("study")) != (was.storage, was.study):
+        raise UsageError(
+            f"This search keeps its trials in a database, and its address is not taken from a file, which may be "
+            f"somebody else's. If you know it, give it again: storage={was.storage} study={was.study}"
+        )
+    return was.model_dump()

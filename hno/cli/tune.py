@@ -26,7 +26,7 @@ from hno.cli.confs import config_dir
 from hno.cli.objective import named
 from hno.cli.perform import Task
 from hno.cli.results import Results
-from hno.cli.search import DATABASE, STUDY, Search, before, judged, taken
+from hno.cli.search import DATABASE, STUDY, Search, before, judged, same_place, taken
 from hno.cli.sweep import TRIAL, Job
 from hno.cli.train import head, train
 from hno.evaluation.format import counted, significant
@@ -46,11 +46,7 @@ def run(given: Arguments) -> int:
     words, rest = taken(given.overrides)
     folder = _folder(rest)
     if folder is not None:
-        was = before(folder)["search"]
-        if moved := [key for key in ("storage", "study") if key in words and words[key] != was[key]]:
-            raise UsageError(f"A search goes on with the study that it has: leave {moved[0]}= out.")
-        was = {key: value for key, value in was.items() if was["storage"] or key != "study"}
-        words = {**was, **words}
+        words = {**same_place(before(folder)["search"], words), **words}
     searching = Searching(judged(words))
     task = Task("train", check, head, partial(work, searching.search), search=searching)
     return launch.run(task, given._replace(overrides=rest, flags={**given.flags, "--multirun": ""}))
@@ -76,6 +72,11 @@ class Searching(NamedTuple):
 
     search: Search
     command: str = "tune"
+
+    @property
+    def place(self) -> list[str]:
+        """The words that say where trials are kept, unless that is the folder of the search."""
+        return [word for word in self.search.words() if word.startswith(("storage=", "study="))]
 
     def check(self, words: Sequence[str], dry: bool) -> bool:
         """Refuse a search that makes no sense, before anything is written; a dry one is printed.

@@ -59,45 +59,51 @@ def render(sweep: Sweep, refresh: float | None = None, place: Path | None = None
     """
     runs, found = sweep.runs, recipes(sweep.runs)
     cards, chosen = _cards(found, runs), best(found)
-    curves = page_data.learning_curves(found, runs)
     listed, kept, total = parts(runs, keep or (lambda part: part))
-    data = {
+    data = _data(sweep, found, cards, place) | {"parts": kept, "episodes": listed, "refresh": refresh}
+    common, differing = _settings(runs, found)
+    sections = [(run, section_tables(run)) for run in runs]
+    games = {game: [one for one in chosen if one.game == game] for game in sorted({one.game for one in found})}
+    return _template().render(
+        sweep=sweep, recipes=found, single=len(runs) == 1,
+        games={game: (headline(own), own) for game, own in games.items()}, cards=cards,
+        unfinished=[run for run in runs if not run.finished and (len(runs) == 1 or run.status != "pruned")],
+        filters={name: _choices(runs, name) for name in FILTERS},
+        curve_games=sorted({one["game"] for one in data["curves"]}),
+        near_games=sorted({one["game"] for one in data["clearances"]}), recipe_table=recipe_table(found),
+        run_table=run_table(runs), labels=label_tables(runs), sections=[entry for entry in sections if entry[1]],
+        common=common, differing=differing, cached=CACHED, shown=len(listed), total=total,
+        landscapes=data["landscapes"], refresh=refresh, themes=vega.THEMES, font=Markup(vega.FONT),
+        vega=Markup(vega.library().replace("</script", "<\\/script").replace("<!--", "<\\!--")), data=embedded(data),
+    )  # fmt: skip
+
+
+def _data(sweep: Sweep, found: Sequence[Recipe], cards: Sequence[dict[str, Any]], place: Path | None) -> dict[str, Any]:
+    """What the page's scripts draw from, but for single runs."""
+    runs = sweep.runs
+    return {
         "maps": {card["id"]: page_data.heat_map(card["recipe"].types) for card in cards if "run" not in card},
         "comparison": page_data.comparison(found),
-        "clearances": (near := clearances.curves(found)),
-        "curves": curves,
+        "clearances": clearances.curves(found),
+        "curves": page_data.learning_curves(found, runs),
         "runs": [{**names_of(run), "run": run.name} for run in runs],
-        "parts": kept,
-        "episodes": listed,
         "scenes": page_data.scenes(runs),
         "members": {card["id"]: [run.name for run in card["recipe"].runs] for card in cards},
         "landscapes": landscapes.entries(runs, place),
         "trials": trials.points(sweep.study) if sweep.study else {},
         "charts": {**specifications(), "landscape": landscapes.chart()},
         "themes": {name: {"config": vega.chart_config(name), "signals": vega.signals(name)} for name in vega.THEMES},
-        "refresh": refresh,
     }
-    common, differing = _settings(runs, found)
-    sections = [(run, section_tables(run)) for run in runs]
-    games = {game: [one for one in chosen if one.game == game] for game in sorted({one.game for one in found})}
+
+
+def _template() -> jinja2.Template:
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("hno.report", "assets"), autoescape=True, undefined=jinja2.StrictUndefined,
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
     environment.globals |= {"format": text, "verdicts": verdicts, "names_of": names_of}
     environment.globals |= {"validity": validity, "trials": trials}
-    return environment.get_template("page.html.j2").render(
-        sweep=sweep, recipes=found, single=len(runs) == 1,
-        games={game: (headline(own), own) for game, own in games.items()}, cards=cards,
-        unfinished=[run for run in runs if not run.finished and (len(runs) == 1 or run.status != "pruned")],
-        filters={name: _choices(runs, name) for name in FILTERS},
-        curve_games=sorted({one["game"] for one in curves}),
-        near_games=sorted({one["game"] for one in near}), recipe_table=recipe_table(found),
-        run_table=run_table(runs), labels=label_tables(runs), sections=[entry for entry in sections if entry[1]],
-        common=common, differing=differing, cached=CACHED, shown=len(listed), total=total,
-        landscapes=data["landscapes"], refresh=refresh, themes=vega.THEMES, font=Markup(vega.FONT),
-        vega=Markup(vega.library().replace("</script", "<\\/script").replace("<!--", "<\\!--")), data=embedded(data),
-    )  # fmt: skip
+    return environment.get_template("page.html.j2")
 
 
 def embedded(content: Any) -> Markup:

@@ -49,10 +49,11 @@ def table(study: Study) -> Table:
 def points(study: Study) -> dict[str, list[dict[str, Any]]]:
     """Trials by objective, with the best value so far; those without numbers have none."""
     found: dict[str, list[dict[str, Any]]] = {}
+    finished = {one.number for one in study.finished}
     for at, name in enumerate(study.objectives):
         least, rows = math.inf, []
         for one in study.trials:
-            value = _values(one)[at] if one in study.finished else None
+            value = _values(one)[at] if one.number in finished else None
             least = least if value is None else min(least, value)
             so_far = None if least == math.inf else least
             rows.append({"trial": one.number, "value": value, "so_far": so_far, "state": one.state, "tip": _tip(one)}

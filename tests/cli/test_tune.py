@@ -20,10 +20,11 @@ from hno.cli.perform import Task, perform
 from hno.cli.pruning import Pruning
 from hno.cli.results import PrunedError, Results
 from hno.cli.resume import own_configuration
-from hno.cli.search import Proposer, Search, judged, taken
+from hno.cli.search import Proposer, Search, judged, same_place, taken
 from hno.cli.settings import TrainSettings
 from hno.cli.space import space
 from hno.cli.study import PROPOSERS, ByNumber, Trials, check_asked, opened
+from hno.cli.tune import Searching
 from hno.training.validation import ClosedLoopValidation, Score
 from tests.cli.conftest import SMOKE, Command, refused
 
@@ -226,6 +227,29 @@ def test_without_optuna_one_sentence_says_how_to_install_it(command: Command, mo
 def test_a_storage_that_cannot_be_used_is_named(command: Command, tmp_path: Path) -> None:
     words = (f"storage=sqlite:///{tmp_path}/no/where.db", "study=mine", "--to", str(tmp_path / "run"))
     refused(command("tune", *SMOKE, LR, *words, folder="none"), "The study cannot be kept in", "unable to open")
+
+
+def test_a_folder_opens_no_database_unless_the_command_line_names_it(command: Command, tmp_path: Path) -> None:
+    """A folder may be somebody else's."""
+    place = {"storage": f"sqlite:///{tmp_path}/precious.db", "study": "ours"}
+    folder = tmp_path / "search"
+    folder.mkdir()
+    (folder / "study.json").write_text(json.dumps({"mark": "m", "search": {"trials": 7, **place}}))
+    other = f"storage=sqlite:///{tmp_path}/other.db"
+    for words in ((), ("study=ours",), (other, "study=ours"), (f"storage={place['storage']}", "study=mine")):
+        run = command("tune", f"sweep={folder}", *words, folder="none")
+        refused(run, "give it again: storage=", "study=ours")
+        assert run.code == 2
+    assert [path.name for path in tmp_path.iterdir()] == ["search"]
+    again = Searching(judged({**same_place({"trials": 7, **place}, place), **place}))
+    assert again.search.trials == 7
+    assert again.place == [f"{key}={value}" for key, value in place.items()]
+
+
+@pytest.mark.parametrize("content", [{}, {"mark": "m"}, {"mark": 1, "search": {}}, {"mark": "m", "search": {"x": 1}}])
+def test_a_file_that_is_of_no_search_is_refused(command: Command, tmp_path: Path, content: dict[str, Any]) -> None:
+    (tmp_path / "study.json").write_text(json.dumps(content))
+    assert command("tune", f"sweep={tmp_path}", folder="none").code == 2
 
 
 @pytest.mark.parametrize("name", [*PROPOSERS])
