@@ -20,16 +20,24 @@ TINY = {
 
 
 @pytest.mark.usefixtures("cache", "clean_globals")
-def test_training_and_evaluation_as_calls(tmp_path: Path) -> None:
-    policy = hno.train("narrow_road", "hno", tmp_path / "run", {**TINY, "activation": "tanh"})
+def test_training_and_evaluation_as_calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each leaves the landscape of what it has, unless there is no folder whose page could show it."""
+    monkeypatch.setattr("hno.evaluation.landscape.page_program", lambda operator: {"nodes": [], "outputs": {}})
+    policy = hno.train(
+        "narrow_road", "hno", tmp_path / "run", {**TINY, "activation": "tanh", "evaluation.landscape": True}
+    )
     assert policy.names() == {"game": "narrow_road", "operator": "hno", "function": "potential", "activation": "tanh"}
     tau, theta = torch.tensor([3.0]), torch.ones(1, 2)
     x = policy.game.initial_box.sample(1, torch.Generator().manual_seed(0))
     assert policy.value(tau, x, theta).shape == (1, 2)
-    assert json.loads((tmp_path / "run" / "results.json").read_text())["status"] == "finished"
+    results = json.loads((tmp_path / "run" / "results.json").read_text())
+    assert (results["status"], results["landscape"]) == ("finished", "landscape.js")
+    assert (tmp_path / "run" / "landscape.js").exists()
     settings = {"theta": "1,1", "starts": 4, "workers": 1, "dt": 0.1, "residuals": False}
-    found = hno.evaluate(tmp_path / "run", settings=settings)
-    assert found["status"] == "finished"
+    found = hno.evaluate(tmp_path / "run", tmp_path / "evaluation", settings)
+    assert (found["status"], found["landscape"]) == ("finished", "landscape.js")
+    assert (tmp_path / "evaluation" / "landscape.js").exists()
+    assert "landscape" not in hno.evaluate(tmp_path / "run", settings=settings)
     assert [row["theta"] for row in found["table"]] == [(1.0, 1.0)]
 
 
